@@ -66,20 +66,21 @@ def test_prepare_batch():
     np.testing.assert_allclose(batch.advantage, normalised.ravel(), rtol=1e-4, atol=1e-5)
 
 
-def test_policy_objective_is_pessimistic():
-    cases = [(1.0, 2.0, 2.0), (1.5, 2.0, 2.4), (0.5, 2.0, 1.0), (1.5, -2.0, -3.0), (0.5, -2.0, -1.6)]
-    for ratio, advantage, expected in cases:
+def test_clipped_objective_and_value_loss():
+    for ratio, advantage, expected in (
+        (1.0, 2.0, 2.0),
+        (1.5, 2.0, 2.4),
+        (0.5, 2.0, 1.0),
+        (1.5, -2.0, -3.0),
+        (0.5, -2.0, -1.6),
+    ):
         got = ppo.policy_objective(jnp.array([ratio]), jnp.array([advantage]), 0.2)
         assert float(got) == pytest.approx(expected, rel=1e-5)
-
-
-def test_value_loss_is_clipped_and_huber():
-    cases = [
+    for *values, expected in (
         (1.0, 1.0, 3.0, 2.0),  # half the square
         (2.0, 0.0, 3.0, 3.125),  # clipped to 0.5, so 2.5 away: the larger of the two
         (30.0, 30.0, 0.0, 250.0),  # linear beyond 10
-    ]
-    for *values, expected in cases:
+    ):
         got = ppo.value_loss(*(jnp.array([value]) for value in values), SETTINGS)
         assert float(got) == pytest.approx(expected, rel=1e-5)
 

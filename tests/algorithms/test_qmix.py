@@ -27,10 +27,6 @@ def untrained() -> QMIX:
     return init(jax.random.key(0), 2, 2, 3, 2, SETTINGS)
 
 
-def test_mix_of_vdn_is_a_sum():
-    np.testing.assert_allclose(mix(None, jnp.array([[1.0, -2.0, 4.0]]), jnp.zeros((1, 0))), [3.0])
-
-
 def test_mixer_is_monotonic():
     """Its slope is never negative, and depends on the state."""
 
@@ -43,6 +39,7 @@ def test_mixer_is_monotonic():
     slopes = np.asarray(jax.jit(jax.vmap(slope))(jax.random.split(jax.random.key(0), 50), jnp.geomspace(0.1, 10, 50)))
     assert (slopes >= 0).all()
     assert not np.isclose(slopes[:, 0], slopes[:, 1], rtol=1e-3).all()
+    np.testing.assert_allclose(mix(None, jnp.array([[1.0, -2.0, 4.0]]), jnp.zeros((1, 0))), [3.0])  # VDN has a sum
 
 
 def test_td_targets_if_all_actions_are_available():
@@ -52,12 +49,11 @@ def test_td_targets_if_all_actions_are_available():
     np.testing.assert_allclose(targets[1:], [[1.093696, 2.502918, 1]], rtol=1e-5, atol=2e-6)
 
 
-@pytest.mark.parametrize("max_grad_norm", [10.0, 0.5])
-def test_update(max_grad_norm):
+def test_update():
     """Adam's first mean is a tenth of the gradient, whose norm is 7.5. Its first step does not depend on this norm."""
-    settings = SETTINGS.model_copy(update={"max_grad_norm": max_grad_norm})
+    settings = SETTINGS.model_copy(update={"max_grad_norm": 0.5})
     after, metrics = update(worked_state(), numpy_sequences(), KEEP, settings)
-    factor = 0.1 * min(1, max_grad_norm / PINNED["grad_norm"])
+    factor = 0.1 * 0.5 / PINNED["grad_norm"]
     expected = jax.tree.map(lambda leaf: factor * leaf, numpy_networks(PINNED["grad"]))
     assert_close(after.optimizer[0].mu, expected, rtol=1e-4, atol=3e-7)
     mask = np.asarray(PINNED["mask"])
@@ -78,14 +74,11 @@ def test_update_copies_targets(untrained):
     assert equal(untrained.online, untrained.target)
 
 
-@pytest.mark.parametrize(
-    ("td_lambda", "expected"),
-    [(0.0, [1 + 0.99 * 5, 0.99 * 6, 2]), (1.0, [1 + 0.99**2 * 2, 0.99 * 2, 2])],
-)
-def test_lambda_returns(td_lambda, expected):
-    settings = SETTINGS.model_copy(update={"td_lambda": td_lambda})
-    arrays = (jnp.array([row]) for row in ([1.0, 0, 2], [0.0, 0, 1], [1.0, 1, 1], [4.0, 5, 6, 7]))
-    np.testing.assert_allclose(jax.jit(qmix.lambda_returns, static_argnums=4)(*arrays, settings), [expected], rtol=1e-6)
+def test_lambda_returns():
+    arrays = [jnp.array([row]) for row in ([1.0, 0, 2], [0.0, 0, 1], [1.0, 1, 1], [4.0, 5, 6, 7])]
+    for td_lambda, expected in ((0.0, [1 + 0.99 * 5, 0.99 * 6, 2]), (1.0, [1 + 0.99**2 * 2, 0.99 * 2, 2])):
+        settings = SETTINGS.model_copy(update={"td_lambda": td_lambda})
+        np.testing.assert_allclose(qmix.lambda_returns(*arrays, settings), [expected], rtol=1e-6)
 
 
 def test_update_ignores_padding():
@@ -148,9 +141,6 @@ def test_act_explores_uniformly_and_independently(untrained):
     differs = (mixed != greedy).any(axis=-1)
     np.testing.assert_allclose(differs.mean(axis=0), [0.3 / 2, 0.3 * 2 / 3], atol=0.015)
     assert differs.all(axis=1).mean() == pytest.approx(0.3 / 2 * 0.3 * 2 / 3, abs=0.01)
-
-
-def test_epsilon_falls_linearly():
     epsilons = [float(qmix.epsilon(step, QMIXSettings())) for step in (0, 50_000, 100_000, 1_000_000)]
     assert epsilons == pytest.approx([1.0, 0.525, 0.05, 0.05])
 
@@ -165,14 +155,7 @@ def all_games() -> Sequences:
     rooms = np.eye(4)[np.stack([0 * first, 1 + first, 0 * first + 3], axis=1)][..., :3]
     action = np.eye(2)[np.stack([first, first_2, second_1, second_2], axis=1).reshape(16, 2, 2)]
     reward = np.stack([0 * first, REWARD[first, second_1, second_2]], axis=1)
-    arrays = (
-        np.repeat(rooms[:, :, None], 2, axis=2),
-        rooms,
-        action,
-        reward,
-        np.tile([0, 1], (16, 1)),
-        np.ones((16, 2)),
-    )
+    arrays = np.repeat(rooms[:, :, None], 2, axis=2), rooms, action, reward, np.tile([0, 1], (16, 1)), np.ones((16, 2))
     observation, state, action, reward, terminated, mask = (jnp.asarray(array, jnp.float32) for array in arrays)
     return Sequences(observation, state, jnp.ones((16, 3, 2, 2), bool), action, reward, terminated, mask)
 

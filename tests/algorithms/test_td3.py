@@ -52,26 +52,17 @@ def test_update_delays_policy_and_targets(state):
         for actor in (state.online.actor, second.online.actor)
     )
     assert q_after > q_before  # by critic 1
+    ddpg = init(jax.random.key(0), 3, 2, DDPG)  # it has one critic, and no delay
+    assert len(ddpg.online.critics.layers[0].weight) == 1
+    assert not equal(update(ddpg, BATCH, KEY, jnp.array(0), DDPG)[0].target, ddpg.target)
 
 
-def test_update_of_ddpg():
-    """It has one critic, and no delay."""
-    state = init(jax.random.key(0), 3, 2, DDPG)
-    assert len(state.online.critics.layers[0].weight) == 1
-    after, _ = update(state, BATCH, KEY, jnp.array(0), DDPG)
-    assert not equal(after.target, state.target)
-
-
-def test_explore_is_clipped(state):
+def test_explore_and_init(state):
+    """Actions are clipped. Weights are uniform in ±1/sqrt(fan-in), as published, and each critic differs."""
     noise = jnp.full((16, 2), 1e3).at[0].set(1.0)
     action = td3.explore(state.online.actor, BATCH.observation, noise, SETTINGS)
     np.testing.assert_allclose(action[0], td3.act(state.online.actor, BATCH.observation)[0] + 0.1, rtol=1e-5)
     np.testing.assert_array_equal(action[1:], 1)
-
-
-def test_init_as_published(state):
-    """Uniform in ±1/sqrt(fan-in), and each critic differs."""
-    largest = np.abs(state.online.actor.layers[1].weight).max()
-    assert 0.9 * 8**-0.5 < largest <= 8**-0.5
+    assert 0.9 * 8**-0.5 < np.abs(state.online.actor.layers[1].weight).max() <= 8**-0.5
     first, second = state.online.critics.layers[0].weight
     assert not np.array_equal(first, second)

@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 
+from helpers.jax_toy_envs import echo_spec
 from helpers.small_configs import ONE_TEAM, SUM_CREDIT, small_config
 from helpers.toy_envs import pick_spec, toy_spec
 from lare_rl.algorithms.qmix import QMIXSettings
@@ -16,6 +17,8 @@ from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, Cr
 from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.envs.load import read_task
 from lare_rl.errors import LareError
+
+ECHO_STATE = echo_spec(credit_scope="state", observation_size=9, action_size=9)
 
 
 def resolve_named(task, settings):
@@ -41,11 +44,15 @@ def resolve_named(task, settings):
         ("CN-6", {"algorithm": "vdn", "vdn": {"monotonic": True}}, ["vdn.monotonic = True", "use --algorithm qmix"]),
         ("CN-6", {"algorithm": "qmix", "qmix": {"monotonic": False}}, ["qmix.monotonic", "use --algorithm vdn"]),
         ("CN-6", {"algorithm": "qmix", "method": "rd", "capacity": 999}, ["capacity = 999", "iteration", "1000"]),
+        (pick_spec(), {"algorithm": "sac"}, ["sac needs continuous actions", "ppo"]),
+        (ECHO_STATE, {"method": "lare-rd-shared"}, ["lare-rd-shared", "credit_scope = 'state'"]),
+        (ECHO_STATE, {"method": "stas"}, ["stas"]),
+        (echo_spec(), {"method": "arel"}, ["arel reads whole episodes"]),
     ],
 )
 def test_resolve_refuses(task, settings, texts):
     with pytest.raises(LareError) as error:
-        resolve_named(task, settings)
+        resolve(Settings(**settings), read_task(task) if isinstance(task, str) else task)
     assert all(text in str(error.value) for text in texts)
 
 
@@ -65,14 +72,6 @@ def test_resolve_refuses(task, settings, texts):
 def test_steps_are_rounded_up_to_whole_iterations(task, settings, steps, evaluate_every):
     resolved = resolve_named(task, settings)
     assert (resolved.steps, resolved.evaluate_every) == (steps, evaluate_every)
-
-
-def test_resolve_refuses_algorithm_and_method_of_other_tasks(echo):
-    with pytest.raises(LareError, match=r"sac needs continuous actions.*ppo"):
-        resolve(Settings(algorithm="sac"), pick_spec())
-    task = echo.model_copy(update={"credit_scope": "state", "observation_size": 9, "action_size": 9})
-    with pytest.raises(LareError, match=r"lare-rd-shared.*credit_scope = 'state'"):
-        resolve(Settings(method="lare-rd-shared"), task)
 
 
 def test_resolve_defaults(echo):
@@ -106,12 +105,6 @@ def test_resolve_defaults(echo):
     assert resolve_named("CN-6", {"method": "lare-rd"}).first_fit == "held-out"
 
 
-def test_resolve_keeps_set_values():
-    values = {"method": "dense", "steps": 4100, "evaluate_every": 2050, "evaluation_episodes": 3}
-    resolved = resolve_named("CN-6", values)
-    assert {name: getattr(resolved, name) for name in values} == values
-
-
 @pytest.mark.parametrize(("task", "default"), [("CN-6", MULTI_AGENT_CREDIT), ("Reacher-v4", CreditSettings())])
 def test_resolve_completes_credit(task, default):
     """A set value replaces the algorithm's, even if it is the default of the class."""
@@ -120,7 +113,7 @@ def test_resolve_completes_credit(task, default):
         assert resolve_named(task, {"credit": credit}).credit == default.model_copy(update=changes | {"exact": "no"})
 
 
-def test_resolve_fit_updates():
+def test_resolve_fit_updates_and_score():
     """The fit of diaster is expensive: one update for 50 steps."""
     ppo = {"algorithm": "ppo", "rollout_steps": 2000}
     cases = [
@@ -131,9 +124,6 @@ def test_resolve_fit_updates():
     ]
     for expected, settings in cases:
         assert resolve_named("Reacher-v4", settings).fit_updates == expected
-
-
-def test_resolve_score():
     cases = [
         (None, "auto", "auto"),
         ("average", "auto", "average"),
@@ -145,16 +135,13 @@ def test_resolve_score():
         assert resolve(settings, toy_spec(score=task_score)).credit.score == score
 
 
-def test_resolve_normalises_settings_without_effect():
+def test_settings_without_effect_and_replay_rows():
     """Runs that are the same have the same settings."""
     fixed_length = [{"method": "lare-rd", "credit": {"score": score}} for score in ("auto", "sum", "average")]
     assert len({resolve_named("CN-6", settings) for settings in fixed_length}) == 1
     assert resolve_named("Reacher-v4", {"method": "bayes", "scored_observation": "before"}).scored_observation is None
     assert resolve_named("Reacher-v4", {"method": "bayes", "scored_observation": "after"}).scored_observation == "after"
     assert resolve_named("SMAX-2s3z", {"method": "rd"}).credit.score == "sum"
-
-
-def test_replay_rows():
     ppo = {"algorithm": "ppo", "steps": 100_000}
     cases = [
         ("Reacher-v4", ppo | {"method": "rrdu"}, 50, 200_002),
@@ -203,12 +190,9 @@ def test_check_training_accepts():
     ]
     for method, changes in cases:
         check(method, **changes)
-
-
-def test_raw_features_of_both_observations_count():
     env = EnvSpec((Team("agent", 0, 1),), 600, 1, True, 12)
     check_training(small_config("bayes", "ppo", env=env))
-    with pytest.raises(LareError, match=r"1024.* 1201"):
+    with pytest.raises(LareError, match=r"1024.* 1201"):  # the raw features of both observations count
         check_training(small_config("bayes", "ppo", env=env, scored_observation="both"))
 
 
@@ -226,20 +210,13 @@ def test_check_training_refuses_a_loop_that_does_not_fit():
         check_training(small_config("rd", "td3", credit=exact))
 
 
-@pytest.mark.parametrize(
-    ("max_steps", "environments", "rollout_steps"),
-    [
-        (360, None, 2160),
-        (20, None, 2000),
-        (500, None, 2000),
-        (5000, None, 2000),
-        (360, 4, 360),
-        (1000, 4, 500),
-        (1000, 500, 16),
-    ],
-)
-def test_rollouts_of_ppo_are_whole_episodes(max_steps, environments, rollout_steps):
-    task = pick_spec(environment="toys/Endless-v0", max_episode_steps=max_steps)
-    resolved = resolve(Settings(method="bayes", environments=environments), task)
-    assert resolved.rollout_steps == rollout_steps
-    assert resolved.steps % resolved.iteration_steps == resolved.evaluate_every % resolved.iteration_steps == 0
+def test_rollouts_of_ppo_are_whole_episodes():
+    alone, several = (
+        ((360, 2160), (20, 2000), (500, 2000), (5000, 2000)),
+        ((360, 4, 360), (1000, 4, 500), (1000, 500, 16)),
+    )
+    for max_steps, environments, rollout_steps in (*((limit, None, steps) for limit, steps in alone), *several):
+        task = pick_spec(environment="toys/Endless-v0", max_episode_steps=max_steps)
+        resolved = resolve(Settings(method="bayes", environments=environments), task)
+        assert resolved.rollout_steps == rollout_steps
+        assert resolved.steps % resolved.iteration_steps == resolved.evaluate_every % resolved.iteration_steps == 0

@@ -1,7 +1,6 @@
 """Settings as a user gives them, read back, and without effect."""
 
 import math
-import re
 
 import pytest
 
@@ -31,15 +30,12 @@ def test_settings_complete_hyperparameters_from_the_algorithm(name):
     ("settings", "texts"),
     [
         ({"credit": {"step": 800}}, ["'credit.step'", "'steps'"]),
-        ({"credit": {"fit": 3}}, ["'credit.fit'", "hidden, learning_rate"]),
         ({"credit": {"sampled_steps": 1}}, ["credit.sampled_steps = 1"]),
         ({"credit": {"hidden": (0,)}}, ["credit.hidden", "0"]),
         ({"gamma": 0.9}, ["'gamma'", "'td3.gamma'"]),
         ({"td3.gamma": 0.9}, ["'td3.gamma'", "td3={'gamma': ...}"]),
-        ({"td3": {"gamma": 3}}, ["td3.gamma = 3"]),
         ({"td3": 3}, ["td3 = 3", "table"]),
         ({"qmix": {"max_grad_norm": math.inf}}, ["qmix.max_grad_norm = inf", "finite"]),
-        ({"credit": {"weight_decay": math.inf}}, ["credit.weight_decay = inf", "finite"]),
         ({"algorithm": "dqn"}, ["'dqn'", "td3, ddpg"]),
         ({"method": "lare"}, ["'lare'", "lare-bayes"]),
         ({"steps": 2**30 + 1}, ["steps = 1073741825", "1073741824"]),
@@ -52,20 +48,6 @@ def test_settings_refuse(settings, texts):
     with pytest.raises(LareError) as error:
         Settings(**settings)
     assert all(text in str(error.value) for text in texts)
-
-
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({"steps": None}, "steps = None"),
-        ({"hyperparameters": {"gamma": 2}}, "hyperparameters.gamma = 2"),
-        ({"algorithm": "dqn"}, "'dqn'"),
-    ],
-)
-def test_resolved_settings_refuse(changes, text):
-    values = resolve(Settings(), read_task("Reacher-v4")).model_dump()
-    with pytest.raises(LareError, match=re.escape(text)):
-        ResolvedSettings(**values | changes)
 
 
 def test_settings_accept_models_and_mappings():
@@ -89,21 +71,15 @@ def test_resolved_settings_round_trip(task, algorithm):
     ("task", "settings", "names"),
     [
         ("CN-6", {"td3": {"hidden": (8,)}, "method": "rd"}, ["td3.hidden"]),
-        ("CN-6", {"method": "lare-rd", "credit": {"steps": 800}}, []),
-        ("CN-6", {"fit_every": 3, "method": "rd"}, []),
-        ("CN-6", {"method": "lare-linear", "credit": {"exact": "last"}}, []),
         ("CN-6", {"method": "lare-linear", "capacity": 10_000}, []),
         ("CN-6", {"method": "ircr", "capacity": 10_000}, ["capacity"]),
         ("CN-6", {"method": "rd", "algorithm": "qmix", "capacity": 10_000, "fit_every": 2}, ["fit_every"]),
         ("CN-6", {"method": "lare-bayes", "first_fit": "published"}, ["first_fit"]),
         ("Reacher-v4", {"method": "dense", "scored_observation": "after", "draw": 1}, ["scored_observation", "draw"]),
-        ("Reacher-v4", {"method": "bayes", "scored_observation": "after"}, []),
         ("Reacher-v4", {"method": "rd", "credit": {"sampled_steps": 10}}, ["credit.sampled_steps"]),
         ("Reacher-v4", {"method": "rrd", "credit": {"sampled_steps": 10}}, []),
         ("Reacher-v4", {"method": "lare-linear", "credit": {"sum_form": True, "score": "sum"}}, ["credit.sum_form"]),
         ("Reacher-v4", {"method": "lare-rrdu", "credit": {"episodes": 1}}, ["credit.episodes"]),
-        ("Reacher-v4", {"method": "lare-signs", "credit": {"score": "sum"}}, ["credit.score"]),
-        ("Reacher-v4", {"method": "vib-rd", "credit": {"bottleneck": 3}}, []),
         ("Reacher-v4", {"method": "diaster", "fit_updates": 9, "credit": {"episodes": 4}}, []),
         ("Reacher-v4", {"method": "rd", "fit_every": 3, "fit_updates": 9}, ["fit_every", "fit_updates"]),
         ("Reacher-v4", {"method": "rd", "algorithm": "ppo", "fit_every": 3, "fit_updates": 9}, []),
@@ -115,7 +91,6 @@ def test_resolved_settings_round_trip(task, algorithm):
         ("Reacher-v4", {"method": "dense", "algorithm": "ppo", "capacity": 10_000}, ["capacity"]),
         ("Reacher-v4", {"method": "dense", "algorithm": "ppo", "scale_rewards": True}, ["scale_rewards"]),
         ("Reacher-v4", {"method": "rrdu", "algorithm": "ppo", "capacity": 10_000}, []),
-        ("Reacher-v4", {"method": "dense", "capacity": 10_000}, []),
     ],
 )
 def test_unused_settings(task, settings, names):
@@ -125,26 +100,15 @@ def test_unused_settings(task, settings, names):
     assert not set(names) & set(effective_settings(resolved))
 
 
-@pytest.mark.parametrize(
-    ("settings", "texts"),
-    [
-        ({"td3": {"gamma": 0.5}}, ["td3.gamma", "ppo on Pick", "ppo.gamma"]),
-        ({"td3": {"tau": 0.5}}, ["td3.tau", "ppo on Pick"]),
-        ({"scale_rewards": True}, ["scale_rewards", "ppo on Pick"]),
-        ({"credit": {"steps": 70}}, ["credit.steps", "dense"]),
-    ],
-)
-def test_unused_settings_message(settings, texts):
-    settings = Settings(method="dense", **settings)
-    (message,) = unused_settings(settings, resolve(settings, pick_spec()), pick_spec()).values()
-    assert all(text in message for text in texts)
-
-
-def test_credit_settings_all_have_an_effect():
+def test_messages_of_unused_settings_and_warmup():
+    settings = Settings(method="dense", td3={"gamma": 0.5, "tau": 0.5}, scale_rewards=True, credit={"steps": 70})
+    messages = unused_settings(settings, resolve(settings, pick_spec()), pick_spec())
+    expected = {"td3.gamma": "ppo.gamma", "td3.tau": "ppo", "scale_rewards": "ppo", "credit.steps": "dense"}
+    assert messages.keys() == expected.keys()
+    assert all(
+        f"{name} makes no difference" in messages[name] and text in messages[name] for name, text in expected.items()
+    )
     assert frozenset().union(*(method.settings for method in METHODS.values())) == set(CreditSettings.model_fields)
-
-
-def test_warmup_warning():
     settings = Settings(steps=10_000, algorithm="td3", td3={"warmup": 9_990})
     assert "10,000 are (td3.warmup)" in (warmup_warning(resolve(settings, read_task("Reacher-v4"))) or "")
     longer = settings.model_copy(update={"steps": 10_050})

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from helpers.credit_specs import observation_spec
+from helpers.decoder_toys import decoder_rewards, observed_state
 from helpers.numpy_attention import numpy_attention, numpy_layer_norm, numpy_linear
-from lare_rl.credit import decoder_state, descent
+from lare_rl.credit import descent
 from lare_rl.credit.arel import Block
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoder_state import CreditBatch
@@ -33,19 +34,10 @@ def test_block_against_numpy():
 def test_loss_is_the_published_one_in_other_units():
     """(R - sum_t y_t)^2 + 20 Var_t(y), as published, divided by T^2 and by the square of the scale."""
     spec = observation_spec(FEATURES, METHODS["arel"], CreditSettings(), STEPS, AGENTS)
-    mean_reward, length = jnp.array([3.0, -1.0, 2.0, 0.5]), jnp.full(EPISODES, STEPS)
-
-    @jax.jit
-    def compute():
-        state = decoder_state.init(KEY, spec)
-        state = decoder_state.observe_steps(state, jnp.asarray(ROWS))
-        state = decoder_state.observe_returns(state, mean_reward, length, jnp.ones(EPISODES, bool), None)
-        episode_index = jnp.repeat(jnp.arange(EPISODES), STEPS)
-        batch = CreditBatch(jnp.asarray(ROWS), episode_index, length, mean_reward, mask=jnp.ones(EPISODES))
-        loss, _ = descent.loss_and_gradient(state, batch, KEY, spec)
-        return decoder_state.decoder_rewards(state, batch.inputs, spec), loss
-
-    y, loss = map(np.asarray, compute())
-    y, mean_reward = y.reshape(EPISODES, STEPS, AGENTS)[..., 0], np.asarray(mean_reward)
+    mean_reward, length = np.float32([3.0, -1.0, 2.0, 0.5]), np.full(EPISODES, STEPS)
+    state = observed_state(spec, ROWS, mean_reward, length, KEY)
+    batch = CreditBatch(ROWS, np.repeat(np.arange(EPISODES), STEPS), length, mean_reward, mask=np.ones(EPISODES))
+    loss, _ = jax.jit(descent.loss_and_gradient, static_argnames="spec")(state, batch, KEY, spec)
+    y = np.asarray(decoder_rewards(state, ROWS, spec)).reshape(EPISODES, STEPS, AGENTS)[..., 0]
     published = ((STEPS * mean_reward - y.sum(axis=1)) ** 2).mean() + 20 * y.var(axis=1, ddof=1).mean()
     assert float(loss) * np.mean(mean_reward**2) * STEPS**2 == pytest.approx(float(published), rel=1e-4)

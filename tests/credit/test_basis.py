@@ -13,7 +13,7 @@ def numpy_fourier_terms(u):
     return np.concatenate([wave(k * np.pi * clipped / 4) / k for k in (1, 2, 3) for wave in (np.cos, np.sin)])
 
 
-def test_expand_by_hand():
+def test_expand_by_hand_and_precision():
     basis = Basis(3, 2, extended=True)
     factor_pairs, raw_pairs = [0.5 * -1.0, 0.5 * 2.0, -1.0 * 2.0], [4.0 * -0.3]
     factors = [U[:3], numpy_fourier_terms(U[:3]), factor_pairs]
@@ -23,22 +23,23 @@ def test_expand_by_hand():
     assert basis.n_features == len(want)
     assert basis.group_index.tolist() == [0] * 3 + [1] * 18 + [2] * 3 + [3] * 2 + [4] * 12 + [5]
     assert basis.is_factor_feature.tolist() == [True] * 24 + [False] * 15
-
-
-def test_fourier_terms_have_the_precision_of_float32():
     u = np.linspace(-4, 4, 2001)
     cosine, sine = np.asarray(fourier_terms(jnp.asarray(u[:, None], jnp.float32), 1)).T
     np.testing.assert_allclose(cosine, np.cos(np.pi * u / 4), atol=5e-7)
     np.testing.assert_allclose(sine, np.sin(np.pi * u / 4), atol=5e-7)
 
 
-@pytest.mark.parametrize("extended", [False, True])
-@pytest.mark.parametrize(("n_factors", "n_raw"), [(0, 4), (4, 0), (1, 1), (0, 0)])
-def test_groups_may_be_empty(n_factors, n_raw, extended):
-    basis = Basis(n_factors, n_raw, extended)
-    assert expand(basis, jnp.ones((7, basis.n_inputs))).shape == (7, basis.n_features)
-    assert all(basis.group_sizes.values())
-    assert extended or basis.n_features == basis.n_inputs
+def test_groups_may_be_empty():
+    for extended in (False, True):
+        for n_factors, n_raw in ((0, 4), (4, 0), (1, 1), (0, 0)):
+            basis = Basis(n_factors, n_raw, extended)
+            assert expand(basis, jnp.ones((7, basis.n_inputs))).shape == (7, basis.n_features)
+            assert all(basis.group_sizes.values())
+            assert extended or basis.n_features == basis.n_inputs
+    images = Basis(2, 5000, extended=True)  # their entries are not used
+    assert images.n_inputs == 5002
+    assert expand(images, jnp.zeros((3, 5002))).shape == (3, images.n_features) == (3, 15)
+    assert Basis(0, 5000, extended=False).n_features == 0
 
 
 @pytest.mark.parametrize(("n_raw", "frequencies"), [(12, 3), (73, 3), (74, 2), (100, 2), (200, 0), (393, 0), (900, 0)])
@@ -49,10 +50,3 @@ def test_many_raw_features_have_fewer_frequencies_and_no_pairs(n_raw, frequencie
     assert basis.n_features == n_raw * (1 + 2 * frequencies) + n_pairs
     assert basis.n_features <= max(MAX_FEATURES, n_raw)
     assert Basis(20, 50, extended=True).raw_frequencies == 1  # factors leave less room
-
-
-def test_raw_features_of_images_are_not_used():
-    basis = Basis(2, 5000, extended=True)
-    assert basis.n_inputs == 5002
-    assert expand(basis, jnp.zeros((3, 5002))).shape == (3, basis.n_features) == (3, 15)
-    assert Basis(0, 5000, extended=False).n_features == 0

@@ -40,7 +40,7 @@ def observed(rows):
     return update_mean_std(empty_mean_std(rows.shape[1]), jnp.asarray(rows, jnp.float32))
 
 
-def test_linear_decoder_by_hand():
+def test_linear_decoder_by_hand_and_split_double():
     basis = Basis(1, 2, extended=True)
     weight = np.random.default_rng(0).normal(size=basis.n_features).astype(np.float32)
     mean, std = np.array([1.0, 2.0, 3.0], np.float32), np.array([2.0, 0.0, 0.5], np.float32)
@@ -49,9 +49,6 @@ def test_linear_decoder_by_hand():
     u = np.stack([(rows[..., 0] - 1) / 2, np.zeros((5, 4)), (rows[..., 2] - 3) / 0.5], axis=-1)
     want = np.asarray(expand(basis, jnp.asarray(u, jnp.float32))) @ weight + 0.25
     np.testing.assert_allclose(decoder(jnp.asarray(rows)).r_hat, want, rtol=1e-5, atol=1e-5)
-
-
-def test_split_double_keeps_float64():
     with jax.enable_x64(True):
         numbers = jnp.asarray(1e6 + np.random.default_rng(0).normal(size=10))
         statistics = evidence.empty_statistics(8)._replace(mean=numbers)
@@ -83,32 +80,20 @@ def test_fit_signs_against_trying_all(seed):
     assert float(state.decoder.bias[0]) == 0
 
 
-def fitted_rewards(basis, rows, length, returns, score_types):
-    """Return the fit in closed form to some episodes, and r_hat of their steps if the score is a sum."""
-    with jax.enable_x64(True):
-        state = closed_form.reset_statistics(init(basis, score_types), observed(rows))
-        state = fit(add_episodes(state, rows, length, returns), score_types, max_rounds=60)
-        return state, closed_form.select_score_type(state.decoder, 0)(jnp.asarray(rows, jnp.float32)).r_hat
-
-
-def test_fit_recovers_rewards_of_standardised_factors():
-    rows, length, returns = sample_episodes(count=60)
-    rows = np.concatenate(rows)
-    state, r_hat = fitted_rewards(PLAIN, rows, length, returns, (0, 1))
-    np.testing.assert_allclose(r_hat, rows @ [1.0, -1.0, -1.0], atol=1e-3)
-    assert float(state.n_fitted) == 60
-
-
 def test_fit_recovers_a_product_of_raw_features():
     """Without pairs, at most half of the variation of the rewards could be explained. The factors are noise."""
-    rows = np.random.default_rng(0).normal(size=(150 * 12, 4))
+    rows = np.random.default_rng(0).normal(size=(150 * 12, 4)).astype(np.float32)
     reward = rows[:, -1] * (0.7 + rows[:, -2])
     basis, returns = Basis(2, 2, extended=True), reward.reshape(150, 12).sum(axis=1)
-    _, r_hat = fitted_rewards(basis, rows, np.full(150, 12), returns, (0,))
+    with jax.enable_x64(True):
+        state = closed_form.reset_statistics(init(basis, (0, 1)), observed(rows))
+        state = fit(add_episodes(state, rows, np.full(150, 12), returns), (0, 1), max_rounds=60)
+        r_hat = closed_form.select_score_type(state.decoder, 0)(jnp.asarray(rows)).r_hat
     assert np.corrcoef(r_hat, reward)[0, 1] > 0.99
+    assert float(state.n_fitted) == 150
 
 
-def test_is_due():
+def test_is_due_and_is_stale():
     """After a reset, the old weights do not match the newly standardised features, though no episode is new."""
     state = init(PLAIN, (ScoreType.SUM,))
     assert not closed_form.is_due(state)
@@ -119,9 +104,7 @@ def test_is_due():
     for n_fitted, due in ((0.0, True), (95.0, True), (96.0, False), (reset.n_fitted, True)):
         fitted = state._replace(sufficient_statistics=statistics, n_fitted=jnp.array(n_fitted))
         assert bool(closed_form.is_due(fitted)) == due
-
-
-def test_is_stale():
     for n_steps, stale in ((0.0, True), (66.0, True), (67.0, False)):
-        state = init(PLAIN, (ScoreType.SUM,))._replace(n_steps=jnp.array(n_steps))
-        assert bool(closed_form.is_stale(state, observed(np.ones((100, 3))))) == stale
+        assert (
+            bool(closed_form.is_stale(state._replace(n_steps=jnp.array(n_steps)), observed(np.ones((100, 3))))) == stale
+        )

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from helpers.credit_specs import observation_spec
-from helpers.decoder_toys import make_decoder
+from helpers.decoder_toys import decoder_rewards, fit_batches, make_decoder, observed_state, whole_batches
 from helpers.long_tests import long_case
-from lare_rl.credit import decoder_state, descent
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.input_names import InputNames
 from lare_rl.credit.methods import METHODS, Fit
 
@@ -84,33 +82,17 @@ QUICK = {DISTINCT[Fit.ALL_STEPS, "step"]}
 @pytest.mark.parametrize("name", [name if name in QUICK else long_case(name) for name in DISTINCT.values()])
 def test_must_learn_credit_among_agents_from_the_mean_return(name):
     """Each agent's reward is the first feature. Only the return of all agents is observed."""
-    settings, method = CreditSettings(hidden=(16,), learning_rate=3e-3), METHODS[name]
+    settings, method, rng = CreditSettings(hidden=(16,), learning_rate=3e-3), METHODS[name], np.random.default_rng(0)
     n_episodes, n_updates = 64, 20 if method.decoder_kind.whole_episodes else 300
-    rows = np.random.default_rng(0).normal(size=(n_episodes, STEPS, AGENTS, 2)).astype(np.float32)
-    reward, length = rows[..., 0], jnp.full(n_episodes, STEPS)
-    mean_reward = reward.mean(axis=(1, 2))
+    rows = rng.normal(size=(n_episodes, STEPS, AGENTS, 2)).astype(np.float32)
+    reward, flat = rows[..., 0], rows.reshape(-1, AGENTS, 2)
     k = STEPS if method.fit is Fit.ALL_STEPS else 3
-
     two_inputs = replace(method, inputs=InputNames(("observation", "action")))
     spec = replace(observation_spec(1, method, settings, STEPS, AGENTS), method=two_inputs, action_size=1)
-
-    def body(state, key):
-        order = jax.vmap(lambda key: jax.random.permutation(key, STEPS)[:k])(jax.random.split(key, n_episodes))
-        sample = jnp.asarray(rows)[jnp.arange(n_episodes)[:, None], jnp.sort(order, axis=1)].reshape(-1, AGENTS, 2)
-        episode_index = jnp.repeat(jnp.arange(n_episodes), k)
-        batch = CreditBatch(sample, episode_index, length, jnp.asarray(mean_reward), mask=jnp.ones(n_episodes))
-        state, metrics = descent.update(state, batch, key, spec)
-        return state, metrics["credit/loss"]
-
-    @jax.jit
-    def train():
-        state = decoder_state.init(KEY, spec)
-        state = decoder_state.observe_steps(state, jnp.asarray(rows))
-        state = decoder_state.observe_returns(state, jnp.asarray(mean_reward), length, jnp.ones(n_episodes, bool), None)
-        state, losses = jax.lax.scan(body, state, jax.random.split(jax.random.key(0), n_updates))
-        return decoder_state.decoder_rewards(state, jnp.asarray(rows).reshape(-1, AGENTS, 2), spec), losses
-
-    r_hat, losses = train()
+    order = np.sort(rng.permuted(np.tile(np.arange(STEPS), (n_updates, n_episodes, 1)), axis=2)[..., :k])
+    batches = whole_batches(rows[np.arange(n_episodes)[:, None], order], reward.mean(axis=(1, 2)), STEPS)
+    state = observed_state(spec, flat, batches.mean_reward[0], batches.length[0], KEY)
+    state, losses = fit_batches(state, batches, spec)
     assert float(losses[-5:].mean()) < float(losses[:5].mean())
     if method.decoder in ("step", "lrr"):
-        assert np.corrcoef(np.ravel(r_hat), reward.ravel())[0, 1] > 0.9
+        assert np.corrcoef(np.ravel(decoder_rewards(state, flat, spec)), reward.ravel())[0, 1] > 0.9

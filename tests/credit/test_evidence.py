@@ -39,7 +39,7 @@ def sum_up(*episodes, n_chunks=1):
     return statistics
 
 
-def sample_statistics(**options):
+def sample_sums(**options):
     return sum_up(*sample_episodes(**options)[:3])
 
 
@@ -80,12 +80,11 @@ def numpy_fit(means, y, length, max_rounds, shares, noise):
     return y_std * mu, y_mean - y_std * mu @ x_mean, alpha, beta, gamma, log_evidence
 
 
-@pytest.mark.parametrize("n_chunks", [1, 7])
-def test_add_episodes_against_numpy(n_chunks):
+def test_add_episodes_against_numpy():
     means, returns, length, _ = sample_episodes()
     means[:, 0] += 1e3  # there is no cancellation
     length[::3] = 0  # padding
-    statistics = sum_up(means, returns, length, n_chunks=n_chunks)
+    statistics = sum_up(means, returns, length, n_chunks=7)
     means, returns, length = (values[length > 0] for values in (means, returns, length))
     v = np.column_stack([means, returns / length, returns])
     mean = np.average(v, axis=0, weights=length)
@@ -106,15 +105,23 @@ def test_fit_against_numpy(score_type):
             np.testing.assert_allclose(value, want, rtol=1e-4, atol=1e-8)
 
 
-def test_fit_recovers_rewards_and_switches_off_a_useless_group():
+def test_fit_recovers_rewards_where_returns_determine_them():
     means, returns, length, weight = sample_episodes(count=200, noise=0.0)
     posterior = fit(sum_up(means, returns, length))
     np.testing.assert_allclose(posterior.weight, weight, atol=1e-4)
     assert float(posterior.bias) == pytest.approx(0.7, abs=1e-4)
-    noisy = fit(sample_statistics(count=100))
+    noisy = fit(sample_sums(count=100))
     assert noisy.n_effective[0] > 2.9
     assert noisy.n_effective[1] < 0.5
     assert np.abs(noisy.weight[3:7]).max() < 0.01  # the useless group is switched off
+    means, returns, length, _ = sample_episodes()
+    equal = fit(sum_up(means, 0.3 * length, length))
+    assert np.abs(equal.weight).max() < 1e-6
+    assert float(equal.bias) == pytest.approx(0.3)
+    for count, bias in ((0, 0), (1, returns[0] / length[0])):
+        posterior = fit(sum_up(means[:count], returns[:count], length[:count]))
+        assert not np.asarray(posterior.weight).any()
+        assert float(posterior.bias) == pytest.approx(bias)
 
 
 def test_fit_recovers_a_rare_event_from_few_episodes():
@@ -134,17 +141,6 @@ def test_fit_recovers_a_rare_event_from_few_episodes():
         np.testing.assert_allclose(predicted, returns, atol=1.0)
 
 
-def test_few_or_equal_returns_determine_only_the_mean():
-    means, returns, length, _ = sample_episodes()
-    equal = fit(sum_up(means, 0.3 * length, length))
-    assert np.abs(equal.weight).max() < 1e-6
-    assert float(equal.bias) == pytest.approx(0.3)
-    for count, bias in ((0, 0), (1, returns[0] / length[0])):
-        posterior = fit(sum_up(means[:count], returns[:count], length[:count]))
-        assert not np.asarray(posterior.weight).any()
-        assert float(posterior.bias) == pytest.approx(bias)
-
-
 @pytest.mark.parametrize("error", [0.0, 1e-18, 1e-9])
 def test_rounding_errors_of_a_constant_have_no_weight(error):
     """Even if they happen to follow the returns. The time has a constant mean if all episodes are equally long."""
@@ -161,7 +157,7 @@ def test_rounding_errors_of_a_constant_have_no_weight(error):
 
 
 def test_fit_continues_from_an_earlier_one():
-    statistics = sample_statistics()
+    statistics = sample_sums()
     posterior = evidence.init_posterior(GROUP_INDEX)
     for _ in range(5):
         posterior = fit_from(posterior, statistics, max_rounds=20)
@@ -170,18 +166,27 @@ def test_fit_continues_from_an_earlier_one():
 
 
 @pytest.mark.parametrize("count", [4, 6, 12, 18])
-@pytest.mark.parametrize("noise_share", [1e-9, 0.999])
-def test_fit_leaves_a_poor_maximum(noise_share, count):
+def test_fit_leaves_a_poor_maximum(count):
     """The earlier fit took nothing as noise, or all variation. The later one is no worse than without it."""
-    statistics = sample_statistics(count=count, noise=0.3)
+    statistics = sample_sums(count=count, noise=0.3)
     fresh, problem = fit(statistics), evidence.regression(statistics, 0, GROUP_INDEX)
-    alpha = problem.equal_alpha * (1e4 if noise_share > 0.5 else 1e-4)
-    start = fresh._replace(alpha=alpha, beta=problem.dof / problem.q / noise_share)
-    assert float(fit_from(start, statistics).log_evidence) >= float(fresh.log_evidence) - 0.01
+    for noise_share, scale in ((1e-9, 1e-4), (0.999, 1e4)):
+        start = fresh._replace(alpha=problem.equal_alpha * scale, beta=problem.dof / problem.q / noise_share)
+        assert float(fit_from(start, statistics).log_evidence) >= float(fresh.log_evidence) - 0.01
 
 
-def test_posterior_std_is_as_large_as_the_error():
-    """Two standard deviations cover most errors, and more episodes make them smaller."""
+def test_posterior_std():
+    """The covariance is the inverse of the precision. Two standard deviations cover most errors; more episodes make them smaller."""
+    statistics = sample_sums()
+    posterior = fit(statistics)
+    precision = posterior.beta * statistics.products[:-2, :-2] + np.diag(posterior.alpha[GROUP_INDEX])
+    covariance = evidence.posterior_covariance(statistics, 0, GROUP_INDEX, posterior)
+    variance = statistics.products[-2, -2] / statistics.n_steps
+    np.testing.assert_allclose(
+        covariance.root.T @ covariance.root, variance * np.linalg.inv(precision), rtol=1e-5, atol=1e-12
+    )
+    centre_std = evidence.posterior_std(covariance, statistics.mean[:-2])
+    assert float(centre_std**2) == pytest.approx(float(variance / (posterior.beta * statistics.n_steps)))
     rows = np.random.default_rng(9).normal(size=(2000, len(GROUP_INDEX)))
     for seed in range(3):
         stds = []
@@ -196,17 +201,6 @@ def test_posterior_std_is_as_large_as_the_error():
             assert error.mean() > 0.2 * std.mean()
             stds.append(std.mean())
         assert stds[1] < stds[0] / 2
-
-
-def test_posterior_covariance_is_the_inverse_of_the_precision():
-    statistics = sample_statistics()
-    posterior = fit(statistics)
-    precision = posterior.beta * statistics.products[:-2, :-2] + np.diag(posterior.alpha[GROUP_INDEX])
-    covariance = evidence.posterior_covariance(statistics, 0, GROUP_INDEX, posterior)
-    want = statistics.products[-2, -2] / statistics.n_steps * np.linalg.inv(precision)
-    np.testing.assert_allclose(covariance.root.T @ covariance.root, want, rtol=1e-5, atol=1e-12)
-    variance = statistics.products[-2, -2] / statistics.n_steps / (posterior.beta * statistics.n_steps)
-    assert float(evidence.posterior_std(covariance, statistics.mean[:-2]) ** 2) == pytest.approx(float(variance))
 
 
 FACTORS = {

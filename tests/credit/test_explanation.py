@@ -79,7 +79,7 @@ def test_slopes_of_a_mean_are_those_of_a_sum_divided_by_the_length():
     np.testing.assert_allclose(8**2 * mean_score.slope_covariance, sum_score.slope_covariance, rtol=1e-3, atol=1e-9)
 
 
-def test_residual_correlates_with_the_missing_raw_feature():
+def test_raw_features():
     result = explain_function(EXTENDED, [1.0, 0, 0, -1.0, 0])
     assert 0.3 < float(result.factors_r2) < 0.7
     assert float(result.total_r2) > 0.98
@@ -88,10 +88,7 @@ def test_residual_correlates_with_the_missing_raw_feature():
     u, length = sample_inputs(120)
     u[:, 3] = 0  # it never varies
     assert explain_rewards(PLAIN, u, length, u @ [1.0, 0, 1.0, 0, 0]).residual_correlation[1] == 0
-
-
-def test_raw_feature_shares():
-    """The effect of two raw features, a line and a pair with a third one, is twice that of the factor."""
+    # The effect of two raw features, a line and a pair with a third one, is twice that of the factor.
     result = explain_function(EXTENDED, lambda u: 2 * u[:, 0] + 2 * u[:, 2] + 2 * u[:, 3] * u[:, 4], noise=0.01)
     line, first, second = result.raw_feature_shares
     raw_share = float(result.total_r2) - float(result.factors_r2)
@@ -102,7 +99,7 @@ def test_raw_feature_shares():
     assert min(line, first + second) > 0.2
 
 
-def test_useless_factors_and_no_factors():
+def test_factors_that_explain_nothing():
     useless = explain_function(PLAIN, [0, 0, 1.0, 0, 0])
     assert float(useless.factors_r2) < 0.1
     assert float(useless.total_r2) > 0.98
@@ -110,10 +107,7 @@ def test_useless_factors_and_no_factors():
     assert (float(none.factors_r2), none.factor_shares.shape, none.slope.shape) == (0, (0,), (0,))
     assert float(none.total_r2) > 0.98
     np.testing.assert_allclose(none.raw_feature_shares, [none.total_r2, 0, 0], atol=0.02)
-
-
-def test_factor_varies():
-    """The second factor varies within episodes only, but for rounding, so that returns do not determine its effect."""
+    # The second factor varies within episodes only, but for rounding, so that returns do not determine its effect.
     u = np.random.default_rng(0).normal(size=(320, 2))
     u[:, 1] = np.tile([1.0, 1, 1, -1, -1, -1, -1, 1], 40) + 1e-9 * u[:, 0]
     result = explain_rewards(PLAIN, u, np.full(40, 8), u @ [1.0, 1.0])
@@ -121,13 +115,18 @@ def test_factor_varies():
     assert not result.explains_mean_reward  # all episodes have the same length
 
 
-def test_factor_shares_add_up_and_few_episodes_explain_nothing():
+def test_sum_of_shares_few_episodes_and_equal_factors():
     for noise in (0.1, 3.0):
         result = explain_function(EXTENDED, [2.0, -1.0, 0.5, 1.0, 0], count=30, noise=noise)
         assert 0 < float(result.factors_r2) < 1
         assert float(result.factor_shares.sum()) == pytest.approx(float(result.factors_r2))
     for count in (1, 2):
         assert np.isnan(explain_function(PLAIN, [1.0, 0, 0, 0, 1.0], count=count).total_r2)
+    u, length = sample_inputs(40)
+    u[:, 1] = -2 * u[:, 0] + 1
+    assert explain_rewards(PLAIN, u, length, u[:, 0]).same_as.tolist() == [1, 0]
+    u[:, 1] += 0.01 * u[:, 2]
+    assert explain_rewards(PLAIN, u, length, u[:, 0]).same_as.tolist() == [-1, -1]
 
 
 def test_factor_that_offsets_another_has_a_negative_share():
@@ -169,16 +168,13 @@ def test_effect_of_a_rare_event():
     assert float(result.linear_share[0]) == pytest.approx(1, abs=1e-3)
 
 
-def test_pair_shares():
+def test_pairs_and_factors_of_different_choices():
     result = explain_function(EXTENDED, lambda u: u[:, 0] * u[:, 1], count=100)
     np.testing.assert_allclose(result.pair_shares, result.factor_shares, atol=0.1)
     u = sample_inputs(100)[0][:, :2]
     line = np.linalg.lstsq(np.column_stack([u, np.ones(len(u))]), u[:, 0] * u[:, 1])[0]
     np.testing.assert_allclose(result.slope, line[:2], atol=0.05)
-
-
-def test_factors_of_different_choices():
-    """Only the factor of the choice is not 0, so that a pair is a line. The first choice earns nothing, and the others their factor."""
+    # Only the factor of the choice is not 0, so that a pair is a line. The first choice earns nothing, and the others their factor.
     random = np.random.default_rng(0)
     length = random.integers(20, 40, size=100)
     choice = [random.choice(3, count, p=random.dirichlet([3.0, 1, 1])) for count in length]
@@ -191,11 +187,3 @@ def test_factors_of_different_choices():
     np.testing.assert_allclose(result.pair_shares, 0, atol=1e-3)
     np.testing.assert_allclose(result.factor_shares[0], 0, atol=1e-3)
     assert result.same_as.tolist() == [-1, -1, -1]
-
-
-def test_factors_that_are_the_same():
-    u, length = sample_inputs(40)
-    u[:, 1] = -2 * u[:, 0] + 1
-    assert explain_rewards(PLAIN, u, length, u[:, 0]).same_as.tolist() == [1, 0]
-    u[:, 1] += 0.01 * u[:, 2]
-    assert explain_rewards(PLAIN, u, length, u[:, 0]).same_as.tolist() == [-1, -1]

@@ -15,7 +15,7 @@ BOTH_STATES = ["speed (before)", "speed (after)"]
 WELL_EXPLAINED = {"factors_r2": 0.99, "total_r2": 0.99, "factor_shares": np.array([0.34, 0.65])}
 ONE_VARIES = WELL_EXPLAINED | {"factor_varies": np.array([True, False])}
 CANCELLING = WELL_EXPLAINED | {"slope": np.array([-20.5, 20.1])}
-NO_RESIDUAL = {"residual_correlation": np.zeros(2)}
+NO_RESIDUAL, LARGE_RESIDUAL = ({"residual_correlation": np.array([size, 0])} for size in (0, 0.5))
 
 
 def explanation(**changes):
@@ -40,17 +40,8 @@ def explanation(**changes):
     return Explanation(**(values | changes))
 
 
-def find(changes, factors=FACTORS, raw_features=(), score_type=None):
-    return explanation_findings(explanation(**changes), score_type, factors, raw_features)
-
-
-def test_largest_groups_are_named():
-    effects = {f"map {i}": float(i) for i in range(11)}  # no episode was fitted to the first
-    findings = explanation_findings(explanation(), None, FACTORS, (), groups=effects)
-    (text,) = (render(finding, MESSAGES) for finding in findings if finding.code == "groups_differ")
-    assert all(f"+{i} in group map {i}" in text for i in range(3, 11))
-    assert "and 2 more" in text
-    assert "map 0" not in text
+def find(changes, factors=FACTORS, raw_features=(), score_type=None, **options):
+    return explanation_findings(explanation(**changes), score_type, factors, raw_features, **options)
 
 
 ABOUT = "factors_explain about_factors"
@@ -62,12 +53,7 @@ LACKING = NO_RESIDUAL | {"factors_r2": 0.8, "raw_feature_shares": np.array([0.02
     [
         ({}, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor about_shares high_when_small"),
         ({}, FACTORS, [], f"{ABOUT} factor factor about_shares"),
-        (
-            {"residual_correlation": np.array([0.5, 0])},
-            FACTORS,
-            RAW_FEATURES,
-            f"{ABOUT} factor factor about_shares high_when_large",
-        ),
+        (LARGE_RESIDUAL, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor about_shares high_when_large"),
         (NO_RESIDUAL | {"factors_r2": 0.05}, FACTORS, [], "factors_explain phi_explains_little"),
         (WELL_EXPLAINED, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor about_shares"),
         (LACKING, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor about_shares phi_lacks_features"),
@@ -87,12 +73,7 @@ def test_codes(changes, factors, raw_features, codes):
     assert [finding.code for finding in find(changes, factors, raw_features)] == codes.split()
 
 
-def test_missing_pairs_are_named():
-    findings = explanation_findings(explanation(), None, (), RAW_FEATURES, lacks_pairs=True)
-    assert findings[-1] == Finding("products_not_read", {"n_raw": 2, "most": 12})
-
-
-def test_shares():
+def test_shares_groups_and_missing_pairs():
     values = find({}, raw_features=RAW_FEATURES)[0].values
     assert (values["share"], values["target"]) == (0.9, Finding("returns", {"n_episodes": 40}))
     assert values["raw"].values["share"] == pytest.approx(0.07)
@@ -102,13 +83,16 @@ def test_shares():
     assert (values["share"], values["target"].code) == (0.97, "mean_rewards")
     largest = [feature.values for feature in values["largest"].values["features"]]
     assert largest == [{"name": RAW_FEATURES[1], "share": 0.77}, {"name": RAW_FEATURES[0], "share": 0.2}]
-
-
-def test_shares_add_up():
     shares = {"factors_r2": 0.905, "total_r2": 0.931, "factor_shares": np.array([0.2545, 0.6505])}
     about, _, *factors = find(shares, raw_features=RAW_FEATURES)[:4]
     assert (about.values["share"], about.values["raw"].values["share"]) == (0.90, 0.03)  # and 7% is not explained
     assert [factor.values["share"] for factor in factors] == [0.65, 0.25]
+    effects = {f"map {i}": float(-i if i == 5 else i) for i in range(11)}  # no episode was fitted to the first
+    (finding,) = (finding for finding in find({}, groups=effects) if finding.code == "groups_differ")
+    assert [group.values["name"] for group in finding.values["groups"]] == [f"map {i}" for i in range(10, 2, -1)]
+    assert finding.values["more"].values == {"count": 2}
+    missing = find({}, (), RAW_FEATURES, lacks_pairs=True)[-1]
+    assert missing == Finding("products_not_read", {"n_raw": 2, "most": 12})
 
 
 def test_score_type():
@@ -121,15 +105,6 @@ def test_score_type():
         assert finding == Finding("score_is_not_log_odds", {"this": types[score_type]})
 
 
-def test_factors_are_in_order_of_shares():
-    cost, speed = find({})[2:4]
-    assert (cost.values["name"], cost.values["share"], cost.values["shape"]) == ("cost", 0.65, None)
-    assert cost.values["effect"].values == pytest.approx({"slope": 2.0, "std": 0.1})
-    assert speed.values["name"] == "speed"
-    assert (cost.values["per_unit"], speed.values["per_unit"]) == (4.0, 0.5)
-    assert find({"linear_share": np.zeros(2)})[2].values["per_unit"] is None
-
-
 @pytest.mark.parametrize(
     ("std", "linear_share", "code"),
     [(0.49, 1, "effect"), (0.51, 1, "unclear_effect"), (0.51, 0, "effect"), (0, 1, "effect")],
@@ -137,11 +112,19 @@ def test_factors_are_in_order_of_shares():
 def test_unclear_effects(std, linear_share, code):
     """An effect of less than two posterior deviations is unclear, unless both are tiny. The line through a curved effect may be flat."""
     changes = {"slope_covariance": np.diag([std**2, 0.01]), "linear_share": np.array([linear_share, 1.0])}
-    (speed,) = (finding for finding in find(changes) if finding.values.get("name") == "speed")
-    assert speed.values["effect"].code == code
     tiny = changes | {"slope": np.array([std / 100, 2.0]), "slope_covariance": np.diag([(std / 60) ** 2, 0.01])}
-    (speed,) = (finding for finding in find(tiny) if finding.values.get("name") == "speed")
-    assert speed.values["effect"].code == "effect"
+    for values, expected in ((changes, code), (tiny, "effect")):
+        (speed,) = (finding for finding in find(values) if finding.values.get("name") == "speed")
+        assert speed.values["effect"].code == expected
+
+
+def test_factors_are_in_order_of_shares():
+    cost, speed = find({})[2:4]
+    assert (cost.values["name"], cost.values["share"], cost.values["shape"]) == ("cost", 0.65, None)
+    assert cost.values["effect"].values == pytest.approx({"slope": 2.0, "std": 0.1})
+    assert speed.values["name"] == "speed"
+    assert (cost.values["per_unit"], speed.values["per_unit"]) == (4.0, 0.5)
+    assert find({"linear_share": np.zeros(2)})[2].values["per_unit"] is None
 
 
 @pytest.mark.parametrize(
@@ -172,69 +155,50 @@ def test_factor_before_and_after():
     assert find(ONE_VARIES, BOTH_STATES)[2].values["states"].values["after"] == Finding("equal_means")
 
 
-def test_residual_values():
-    values = find({}, raw_features=RAW_FEATURES)[-1].values
-    assert values == {
-        "name": RAW_FEATURES[1],
-        "correlation": -0.8,
-        "scored_observation": Finding("scored_observation_may_be_wrong"),
-    }
-    assert find({}, BOTH_STATES, RAW_FEATURES)[-1].values["scored_observation"] is None
-
-
-ANYTHING = {
-    **dict.fromkeys(("share", "slope", "std", "correlation", "value"), 0.5),
-    **dict.fromkeys(
-        ("this", "other", "target", "largest", "features", "name", "names", "raw", "effect", "groups"), "x"
-    ),
-    **dict.fromkeys(("n_episodes", "n_unused", "n_raw", "most", "count"), 3),
-    **dict.fromkeys(("more", "states", "shape", "before", "after", "scored_observation"), None),
-}
-
-
 def test_messages_and_lines():
+    values = {
+        **dict.fromkeys(("share", "slope", "std", "correlation", "value"), 0.5),
+        **dict.fromkeys(("this", "other", "target", "largest", "features", "name", "names", "raw"), "x"),
+        **dict.fromkeys(("effect", "groups", "n_episodes", "n_unused", "n_raw", "most", "count"), 3),
+        **dict.fromkeys(("more", "states", "shape", "before", "after", "scored_observation"), None),
+    }
     for code in MESSAGES:
-        text = render(Finding(code, ANYTHING), MESSAGES)
+        text = render(Finding(code, values), MESSAGES)
         assert text
         assert "{" not in text
-    lines = [render(finding, MESSAGES) for finding in explanation_findings(explanation(), None, FACTORS, RAW_FEATURES)]
+    findings = find({}, raw_features=RAW_FEATURES)
+    lines = [render(finding, MESSAGES) for finding in findings]
     assert "90%" in lines[0]
     assert lines[2:4] == ["- cost: 65%, +2 ± 0.1", "- speed: 25%, +1 ± 0.1"]
+    residual = {"name": RAW_FEATURES[1], "correlation": -0.8}
+    assert findings[-1].values == residual | {"scored_observation": Finding("scored_observation_may_be_wrong")}
+    assert find({}, BOTH_STATES, RAW_FEATURES)[-1].values == residual | {"scored_observation": None}
 
 
 def test_raw_feature_names():
+    """Neither a history nor a difference of observations has names, and the action need not be an input."""
     observation, action = "- 0: price\n[1] (none)\n1:\n2. angle (rad), in a room of\n0.5 m\n", "0: torque"
     assert raw_feature_names(observation, action, {"next_observation": 3, "action": 1}) == [
-        "entry 0 of the observation (price)",
-        "entry 1 of the observation",
-        "entry 2 of the observation (angle (rad), in a room of)",
-        "entry 0 of the action (torque)",
+        *("entry 0 of the observation (price)", "entry 1 of the observation"),
+        *("entry 2 of the observation (angle (rad), in a room of)", "entry 0 of the action (torque)"),
     ]
     assert raw_feature_names("0: price", "", {"observation": 1, "next_observation": 1, "action": 1}) == [
-        "entry 0 of the observation before the step (price)",
-        "entry 0 of the observation after the step (price)",
+        *(f"entry 0 of the observation {side} the step (price)" for side in ("before", "after")),
         "entry 0 of the action",
     ]
-
-
-@pytest.mark.parametrize(
-    ("method", "single_agent", "expected"),
-    [
-        ("bayes", True, ["entry 0 of the observation (price)", "entry 0 of the action"]),
-        ("bayes-progress", True, ["entry 0 of the observation (price)", "entry 0 of the action"]),
-        ("rd", False, ["entry 0 of the observation (price)"]),
-        ("rd", True, []),
-    ],
-)
-def test_raw_feature_names_of_methods(method, single_agent, expected):
-    """Neither a history nor a difference of observations has names, and the action need not be an input."""
-    spec = CreditSpec(
-        method=METHODS[method],
-        settings=CreditSettings(),
-        observation_size=1,
-        action_size=1,
-        single_agent=single_agent,
-        agents=1,
-        max_steps=10,
-    )
-    assert spec.raw_feature_names("0: price", "") == expected
+    price = ["entry 0 of the observation (price)"]
+    for method, agents, expected in (
+        ("bayes", 1, [*price, "entry 0 of the action"]),
+        ("bayes-progress", 1, [*price, "entry 0 of the action"]),
+        ("rd", 2, price),
+        ("rd", 1, []),
+    ):
+        sizes = {
+            "observation_size": 1,
+            "action_size": 1,
+            "single_agent": agents == 1,
+            "agents": agents,
+            "max_steps": 10,
+        }
+        spec = CreditSpec(method=METHODS[method], settings=CreditSettings(), **sizes)
+        assert spec.raw_feature_names("0: price", "") == expected

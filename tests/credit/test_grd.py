@@ -69,11 +69,17 @@ def test_loss_against_numpy(decoder, threshold, monkeypatch):
     assert float(loss) == pytest.approx(want, rel=1e-4)
 
 
-def test_rewards_are_those_of_the_causes(decoder):
+def test_rewards_of_causes_and_loss_without_episodes(decoder):
     mask = np.concatenate([causes(decoder.state_reward), causes(decoder.action_reward)])
     assert 0 < mask.sum() < STATES + ACTIONS
     want = numpy_mlp(decoder.reward_model, mask * ROWS[..., : STATES + ACTIONS])[..., 0]
     np.testing.assert_allclose(decoder(jnp.asarray(ROWS), None).r_hat, want, rtol=1e-4, atol=1e-5)
+    args = jnp.asarray(ROWS), jnp.asarray(LENGTH), jnp.ones(EPISODES), jnp.zeros(EPISODES), KEY
+    loss, gradient = jax.jit(jax.value_and_grad(lambda decoder: decoder.loss(*args)))(decoder)
+    assert float(loss) == pytest.approx(
+        0.1 * negative_log_absence(decoder.state_reward) + 0.2 * negative_log_absence(decoder.action_reward)
+    )
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
 def test_samples_of_masks():
@@ -86,15 +92,6 @@ def test_samples_of_masks():
     gradient = jax.grad(lambda logits: sample_mask(logits, KEY)[0])(near)
     soft = 1 / (1 + np.exp(-0.2))
     np.testing.assert_allclose(gradient[0], [soft * (1 - soft) / 0.01, -soft * (1 - soft) / 0.01], rtol=1e-2)
-
-
-def test_loss_without_episodes_is_finite(decoder):
-    args = jnp.asarray(ROWS), jnp.asarray(LENGTH), jnp.ones(EPISODES), jnp.zeros(EPISODES), KEY
-    loss, gradient = jax.jit(jax.value_and_grad(lambda decoder: decoder.loss(*args)))(decoder)
-    assert float(loss) == pytest.approx(
-        0.1 * negative_log_absence(decoder.state_reward) + 0.2 * negative_log_absence(decoder.action_reward)
-    )
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
 def test_must_learn_causes(monkeypatch):
@@ -118,12 +115,9 @@ def test_must_learn_causes(monkeypatch):
     assert from_action[1].any()
 
 
-def test_inputs_of_another_order_are_refused():
+def test_input_sizes_and_order():
     with pytest.raises(LareError, match=r"reads the inputs observation, action, next_observation, .*'action': 2"):
         make_decoder("grd", {"action": 2, "observation": 3, "next_observation": 3}, STEPS)
-
-
-def test_input_sizes():
     sizes = {"observation": 3, "action": 2, "factors": 4}
     names = methods.TRANSITION.resolve()
     assert input_names.input_sizes(names, sizes) == (("observation", 3), ("action", 2), ("next_observation", 3))

@@ -36,9 +36,6 @@ def test_offsets_against_numpy():
     expected = numpy_offsets(level, y, 4)
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(offsets(means), expected, rtol=1e-3, atol=1e-4)
-
-
-def test_equal_levels_have_small_offsets():
     level, y = sample([20] * 8, between=0.0, within=1.0)
     means = add(empty_level_means(8), level, y.astype(np.float32), np.ones(len(y), bool))
     assert np.abs(offsets(means)).max() < 0.2

@@ -1,4 +1,3 @@
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -75,31 +74,23 @@ def test_wins_are_predicted_better_than_by_least_squares(scale):
     assert np.all((predicted >= 0) & (predicted <= 10))
 
 
-def test_group_that_does_not_matter_is_switched_off():
-    x, _, returns = make_episodes(400, scale=1.5)
-    weight = np.asarray(fit(x, returns).posterior.weight)
-    assert np.abs(weight[3:]).max() < 0.1 * np.abs(weight[:2]).min()
-
-
 def test_payments_are_in_the_unit_of_the_return():
+    """The group that does not matter is switched off."""
     x, _, returns = make_episodes(300, scale=1.5)
-    state = fit(x, returns)
+    state, x = fit(x, returns), x.astype(np.float32)
+    weight = np.asarray(state.posterior.weight)
+    assert np.abs(weight[3:]).max() < 0.1 * np.abs(weight[:2]).min()
     start_value, slope = logistic.to_returns(state)
-    payments = start_value + slope * (jnp.asarray(x, jnp.float32) @ state.posterior.weight)
-    np.testing.assert_allclose(
-        np.mean(payments), np.mean(logistic.predict(state, jnp.asarray(x, jnp.float32))), rtol=1e-4
-    )
+    payments = start_value + slope * (x @ weight)
+    np.testing.assert_allclose(np.mean(payments), np.mean(logistic.predict(state, jnp.asarray(x))), rtol=1e-4)
     np.testing.assert_allclose(np.polyfit(payments, returns, 1)[0], 1, atol=0.15)
 
 
-def test_fit_changes_nothing_while_all_returns_are_equal():
+def test_equal_returns_and_the_window():
     x, _, _ = make_episodes(20)
     state = fit(x, np.full(20, 3.0))
     assert np.all(state.posterior.weight == 0)
     assert logistic.to_returns(state)[1] == 0
-
-
-def test_window_holds_the_last_episodes():
     x, _, returns = make_episodes(logistic.WINDOW + 10)
     state = logistic.init(GROUP_INDEX)
     with float64():
@@ -108,12 +99,3 @@ def test_window_holds_the_last_episodes():
             rows = np.minimum(np.arange(18) + start, len(x) - 1)
             state = logistic.add_episodes(state, jnp.asarray(x[rows]), jnp.asarray(returns[rows]), chunk)
     assert sorted(np.asarray(state.columns)[:, 0]) == sorted(x[10:, 0].astype(np.float32))
-
-
-def test_fit_of_one_seed_is_that_of_several_under_vmap():
-    states = [fit(*make_episodes(50, seed)[::2], rounds=0) for seed in (1, 2)]
-    with float64():
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
-        together = jax.vmap(lambda state: logistic.fit(state, GROUP_INDEX, ROUNDS))(stacked)
-        alone = logistic.fit(states[1], GROUP_INDEX, ROUNDS)
-    np.testing.assert_allclose(together.posterior.weight[1], alone.posterior.weight, rtol=1e-4)

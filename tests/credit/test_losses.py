@@ -6,22 +6,12 @@ import pytest
 from lare_rl.credit import losses
 
 
-def test_sum_form_is_the_squared_error_of_sums():
+def test_sum_form_and_unbiased_error():
     mean, returns, length = jnp.array([0.5, -1.0]), jnp.array([4.0, 3.0]), jnp.array([4, 2])
     weight = losses.episode_weight(length, jnp.ones(2), sum_form=True)
     loss = losses.squared_error(mean, returns / length, weight)
     assert float(loss) == pytest.approx(((0.5 * 4 - 4) ** 2 + (-1.0 * 2 - 3) ** 2) / 2)
     np.testing.assert_array_equal(losses.episode_weight(length, jnp.array([1.0, 0.0]), sum_form=False), [1, 0])
-
-
-# K = 4. The sample variance of 1, 2, 3, 4 is 5/3. Reacher has T < K, where the published coefficient is negative.
-@pytest.mark.parametrize(("length", "want"), [(8, 5 / 3 * 0.5 / 4), (4, 0.0), (3, 0.0), (1, 0.0)])
-def test_subsampling_variance_pinned(length, want):
-    variance = jax.jit(losses.subsampling_variance)(jnp.array([[1.0, 2.0, 3.0, 4.0]]), jnp.array([length]))
-    np.testing.assert_allclose(variance, [want], rtol=1e-6)
-
-
-def test_unbiased_squared_error_has_the_expectation_of_the_full_one():
     rng = np.random.default_rng(0)
     length, k, samples = 12, 5, 40_000
     r_hat, mean_reward = rng.normal(size=length), 0.3
@@ -35,3 +25,10 @@ def test_unbiased_squared_error_has_the_expectation_of_the_full_one():
     assert unbiased == pytest.approx(full, abs=0.01)
     assert biased == pytest.approx(full + bias, abs=0.01)
     assert bias > 0.05
+
+
+# K = 4. The sample variance of 1, 2, 3, 4 is 5/3. Reacher has T < K, where the published coefficient is negative.
+@pytest.mark.parametrize(("length", "want"), [(8, 5 / 3 * 0.5 / 4), (4, 0.0), (3, 0.0), (1, 0.0)])
+def test_subsampling_variance_pinned(length, want):
+    variance = jax.jit(losses.subsampling_variance)(jnp.array([[1.0, 2.0, 3.0, 4.0]]), jnp.array([length]))
+    np.testing.assert_allclose(variance, [want], rtol=1e-6)

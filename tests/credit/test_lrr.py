@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.credit_specs import observation_spec
+from helpers.decoder_toys import fit_batches, observed_state, whole_batches
 from lare_rl.credit import decoder_state, descent
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoder_state import CreditBatch
@@ -73,27 +74,12 @@ def test_fixed_uncertainty_is_rrd(state, batch):
 
 def test_must_learn_rewards_and_where_they_are_uncertain():
     """The mean reward is the first feature. Rewards are noisy where the second feature is positive."""
-    steps, n_episodes, updates = 3, 128, 500
-    spec = observation_spec(FEATURES, METHODS["lrr"], SETTINGS, steps)
-    rng = np.random.default_rng(0)
-    rows = rng.normal(size=(updates, n_episodes, steps, FEATURES)).astype(np.float32)
+    spec, rng = observation_spec(FEATURES, METHODS["lrr"], SETTINGS, 3), np.random.default_rng(0)
+    rows = rng.normal(size=(500, 128, 3, FEATURES)).astype(np.float32)
     noise = 2 * rng.normal(size=rows.shape[:-1]) * (rows[..., 1] > 0)
-    mean_reward = jnp.asarray((rows[..., 0] + noise).mean(axis=-1), jnp.float32)
-    length, episode_index = jnp.full(n_episodes, steps), jnp.repeat(jnp.arange(n_episodes), steps)
-
-    def body(state, episodes):
-        x, target = episodes
-        batch = CreditBatch(x.reshape(-1, 1, FEATURES), episode_index, length, target, mask=jnp.ones(n_episodes))
-        return descent.update(state, batch, KEY, spec)[0], None
-
-    @jax.jit
-    def train():
-        state = decoder_state.init(KEY, spec)
-        state = decoder_state.observe_steps(state, jnp.asarray(rows[0]))
-        state = decoder_state.observe_returns(state, mean_reward[0], length, jnp.ones(n_episodes, bool), None)
-        return jax.lax.scan(body, state, (jnp.asarray(rows), mean_reward))[0]
-
-    state = train()
+    batches = whole_batches(rows[..., None, :], (rows[..., 0] + noise).mean(axis=-1), 3)
+    state = observed_state(spec, rows[0], batches.mean_reward[0], batches.length[0], KEY)
+    state, _ = fit_batches(state, batches, spec)
     x = jnp.asarray(rows[0].reshape(-1, FEATURES))
     output = decoder_state.decode(state.network, state, x, spec)
     assert np.corrcoef(output.r_hat, x[:, 0])[0, 1] > 0.9

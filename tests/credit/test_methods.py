@@ -15,34 +15,25 @@ from lare_rl.credit.methods import METHODS, Fit, Method, Reward, register_method
 from lare_rl.errors import LareError
 
 
-def test_rows_are_consistent():
+def test_rows_and_names():
     for method in METHODS.values():
         assert (method.reward is Reward.PROXY) == (method.fit is not None)
         assert (method.reward in (Reward.PROXY, Reward.DESIGNED)) == (method.inputs is not None)
         assert method.summary
         assert method.source
-
-
-def test_published_rows():
     fits = {"rd": Fit.ALL_STEPS, "rrd": Fit.SAMPLED_STEPS, "rrdu": Fit.SAMPLED_STEPS_UNBIASED}
     for name in (*fits, "lare-rd", "lare-rrdu"):
         inputs = methods.FACTORS if name.startswith("lare-") else methods.RAW
         assert (METHODS[name].inputs, METHODS[name].fit) == (inputs, fits[name.removeprefix("lare-")])
-
-
-def test_encoder_with_unknown_names():
+    for name, words in (("lare_rrdu", "'lare_rrdu' .*'lare-rrdu'"), ("", "dense, episodic, ")):
+        with pytest.raises(LareError, match=words):
+            METHODS.find(name)
     with pytest.raises(LareError, match=r"observation, .*'observations'"):
         input_names.InputNames(("observations",))
     with pytest.raises(LareError, match="history must be the last"):
         input_names.InputNames(("history", "action"))
     with pytest.raises(LareError, match="factors must be"):
         input_names.InputNames(("observation",), ("factors",))
-
-
-@pytest.mark.parametrize(("name", "words"), [("lare_rrdu", "'lare_rrdu' .*'lare-rrdu'"), ("", "dense, episodic, ")])
-def test_find_method_unknown(name, words):
-    with pytest.raises(LareError, match=words):
-        METHODS.find(name)
 
 
 class Squares(eqx.Module):
@@ -67,14 +58,16 @@ def registered(monkeypatch):
         monkeypatch.setattr(registry, "_values", dict(registry._values))
 
 
+def register(fit, init=lambda key, spec: Squares(spec.output_scale * jnp.ones(spec.n_inputs))):
+    register_decoder(Decoder("mine", init))
+    register_method(Method("mine", "mine", "this test", inputs=methods.RAW, fit=fit, decoder="mine"))
+
+
 @pytest.mark.parametrize("fit", [Fit.ALL_STEPS, Fit.DECODER_LOSS, long_case(Fit.SAMPLED_STEPS_UNBIASED)])
 def test_registered_method_is_trained(fit, registered):
-    register_decoder(Decoder("squares", lambda key, spec: Squares(spec.output_scale * jnp.ones(spec.n_inputs))))
-    register_method(
-        Method(f"squares-{fit.name}", "squares", "this test", inputs=methods.RAW, fit=fit, decoder="squares")
-    )
-    assert Settings(method=f"squares-{fit.name}").method == f"squares-{fit.name}"
-    credit = CreditAssigner(f"squares-{fit.name}", observation_space=2, action_space=1, settings=SMALL_CREDIT)
+    register(fit)
+    assert Settings(method="mine").method == "mine"
+    credit = CreditAssigner("mine", observation_space=2, action_space=1, settings=SMALL_CREDIT)
     random = np.random.default_rng(0)
     for _ in range(4):
         s, a, reward = random.normal(size=(10, 2)), random.normal(size=(10, 1)), random.normal(size=10)
@@ -83,19 +76,14 @@ def test_registered_method_is_trained(fit, registered):
     assert np.isfinite(credit.metrics()["credit/loss"])
 
 
-def test_loss_of_a_decoder_is_for_a_single_agent(registered):
+def test_decoders_that_are_refused(registered):
     """Steps of several agents would be mixed with each other: `loss` has an axis of steps, and none of agents."""
-    register_decoder(Decoder("squares", lambda key, spec: Squares(jnp.ones(spec.n_inputs))))
-    register_method(Method("mine", "squares", "this test", inputs=methods.RAW, fit=Fit.DECODER_LOSS, decoder="squares"))
+    register(Fit.DECODER_LOSS)
     with pytest.raises(LareError, match="mine assigns credit to a single agent, and the task has 2 agents"):
         CreditAssigner("mine", observation_space=2, action_space=1, agents=2, max_steps=5)
-
-
-def test_decoder_with_functions_is_refused_in_one_line(registered):
-    register_decoder(Decoder("mlp", lambda key, spec: eqx.nn.MLP(spec.n_inputs, 1, 4, 1, key=key)))
-    register_method(Method("mlp", "mlp", "this test", inputs=methods.RAW, fit=Fit.ALL_STEPS, decoder="mlp"))
-    with pytest.raises(LareError, match=r"'mlp' holds .* instead of eqx.nn.MLP.*, use lare_rl.nn.networks.MLP"):
-        CreditAssigner("mlp", observation_space=2, action_space=1)
+    register(Fit.ALL_STEPS, lambda key, spec: eqx.nn.MLP(spec.n_inputs, 1, 4, 1, key=key))
+    with pytest.raises(LareError, match=r"'mine' holds .* instead of eqx.nn.MLP.*, use lare_rl.nn.networks.MLP"):
+        CreditAssigner("mine", observation_space=2, action_space=1)
 
 
 @pytest.mark.parametrize("agents", [1, 2])
@@ -110,8 +98,7 @@ def test_decoder_with_functions_is_refused_in_one_line(registered):
 )
 def test_output_of_a_decoder_is_checked(call, agents, registered, monkeypatch):
     monkeypatch.setattr(Squares, "__call__", call)
-    register_decoder(Decoder("mine", lambda key, spec: Squares(jnp.ones(spec.n_inputs))))
-    register_method(Method("mine", "mine", "this test", inputs=methods.RAW, fit=Fit.ALL_STEPS, decoder="mine"))
+    register(Fit.ALL_STEPS)
     with pytest.raises(LareError, match=rf"'mine' must return DecoderOutput.* both of the shape \(2, {agents}\) for "):
         CreditAssigner("mine", observation_space=2, action_space=1, agents=agents, max_steps=5)
 

@@ -4,14 +4,9 @@ import numpy as np
 import pytest
 
 from lare_rl.credit import evidence
-from lare_rl.credit.precisions import MIN_NOISE, NUMPY_BACKEND, Posterior, Regression, expand_groups
+from lare_rl.credit.precisions import MIN_NOISE, NUMPY_BACKEND, Regression, expand_groups
 
 GROUP_INDEX = np.array([0, 0, 1, 2, 2])
-
-
-@pytest.fixture
-def problem():
-    return make_problem()
 
 
 def make_problem(constant=()):
@@ -32,26 +27,20 @@ def run_rounds(backend, problem, n_rounds):
     return posterior
 
 
-@pytest.mark.parametrize("constant", [(), (3, 4)])
-def test_rounds_of_numpy_and_jax_are_the_same(constant):
-    problem = make_problem(constant)
+def test_rounds_of_numpy_and_jax_are_the_same():
+    """The precision of constant features stays."""
+    problem = make_problem(constant=(3, 4))
     numpy_posterior = run_rounds(NUMPY_BACKEND, problem, 20)
+    assert numpy_posterior.alpha[2] == problem.equal_alpha[2]
     with jax.enable_x64(True):
         in_jax = jax.tree.map(jnp.asarray, problem._replace(alpha_index=None))._replace(alpha_index=GROUP_INDEX)
         jax_posterior = run_rounds(evidence.JAX_BACKEND, in_jax, 20)
-        for name in Posterior._fields:
-            np.testing.assert_allclose(
-                getattr(numpy_posterior, name), getattr(jax_posterior, name), rtol=1e-9, atol=1e-12
-            )
+        for a, b in zip(numpy_posterior, jax_posterior, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
 
 
-def test_precision_of_constant_features_stays():
-    problem = make_problem(constant=(3, 4))
-    assert run_rounds(NUMPY_BACKEND, problem, 20).alpha[2] == problem.equal_alpha[2]
-
-
-def test_moments_are_those_of_the_inverse(problem):
-    alpha, beta = np.array([1.0, 2.0, 3.0]), 5.0
+def test_moments_are_those_of_the_inverse():
+    problem, alpha, beta = make_problem(), np.array([1.0, 2.0, 3.0]), 5.0
     moments = NUMPY_BACKEND.dense_moments(problem, alpha, beta)
     precision = beta * problem.s + np.diag(alpha[GROUP_INDEX])
     mean = beta * np.linalg.solve(precision, problem.p)
@@ -61,22 +50,17 @@ def test_moments_are_those_of_the_inverse(problem):
     assert moments.residual == pytest.approx(problem.q - 2 * mean @ problem.p + mean @ problem.s @ mean)
 
 
-def test_equal_shares_explain_half_of_the_returns(problem):
-    # The prior variance of y: the sum over groups of trace S / (alpha N), 1/2 in total.
+def test_precisions_and_strengths():
+    """Equal shares explain half of the returns: the prior variance of y is the sum over groups of trace S / (alpha N)."""
+    problem = make_problem()
     trace = np.bincount(GROUP_INDEX, np.diagonal(problem.s))
     np.testing.assert_allclose(trace / problem.equal_alpha / problem.q, [1 / 6] * 3)
-
-
-def test_precisions_are_clipped(problem):
+    groups = run_rounds(NUMPY_BACKEND, problem, 3)
+    strengths = expand_groups(groups, GROUP_INDEX, np.arange(5))
+    np.testing.assert_array_equal(strengths.alpha, groups.alpha[GROUP_INDEX])
+    assert strengths.n_effective.sum() == pytest.approx(groups.n_effective.sum())
     alpha, beta = NUMPY_BACKEND.clip_precisions(problem, np.array([0.0, np.inf, 1.0]), 0.0)
     assert alpha[0] == problem.equal_alpha[0] / 1e6
     assert alpha[1] == problem.equal_alpha[1] * 1e6
     assert beta == problem.dof / problem.q / 2
     assert NUMPY_BACKEND.clip_precisions(problem, alpha, np.inf)[1] == problem.dof / problem.q / MIN_NOISE
-
-
-def test_strengths_start_from_their_groups(problem):
-    groups = run_rounds(NUMPY_BACKEND, problem, 3)
-    strengths = expand_groups(groups, GROUP_INDEX, np.arange(5))
-    np.testing.assert_array_equal(strengths.alpha, groups.alpha[GROUP_INDEX])
-    assert strengths.n_effective.sum() == pytest.approx(groups.n_effective.sum())

@@ -28,7 +28,7 @@ def add(predictions, returns, predicted, mask=None, level=None):
     return add_padded(predictions, *rows)
 
 
-@pytest.mark.parametrize("count", [8, 30, WINDOW, WINDOW + 5, 3 * WINDOW - 1])
+@pytest.mark.parametrize("count", [8, WINDOW, 3 * WINDOW - 1])
 def test_r2_against_numpy(count):
     returns, predicted = sample_predictions(count)
     predictions = empty_predictions(2)
@@ -40,19 +40,6 @@ def test_r2_against_numpy(count):
     np.testing.assert_allclose(squared_errors(predictions), errors, rtol=1e-4)
     want = 1 - errors / ((returns - returns.mean()) ** 2).sum()
     np.testing.assert_allclose(r2(predictions), want, rtol=1e-4, atol=1e-5)
-
-
-def test_masked_episodes_are_ignored():
-    returns, predicted = sample_predictions(20)
-    mask = np.arange(20) % 3 > 0
-    masked = add(empty_predictions(2), returns, predicted, mask)
-    for a, b in zip(masked, add(empty_predictions(2), returns[mask], predicted[mask]), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.parametrize("returns", [np.arange(7.0), np.full(20, 3.1)], ids=["few", "equal"])
-def test_r2_is_nan(returns):
-    assert np.isnan(r2(add(empty_predictions(1), returns, np.zeros((len(returns), 1))))).all()
 
 
 def test_gain_against_numpy():
@@ -81,5 +68,15 @@ def test_gain_covers_the_true_gain():
     np.testing.assert_allclose(errors.mean(), gains.std(), rtol=0.2)
 
 
-def test_gain_is_nan_with_few_episodes():
-    assert np.isnan(gain(add(empty_predictions(1), *map(np.float32, ([1, 2], [[1], [2]]))))).all()
+def test_few_equal_and_masked_returns():
+    for returns in (np.arange(7.0), np.full(20, 3.1)):
+        predictions = add(empty_predictions(1), returns, np.zeros((len(returns), 1)))
+        assert np.isnan([*r2(predictions), *gain(predictions)]).all()
+    returns, predicted = sample_predictions(20)
+    mask = np.arange(20) % 3 > 0
+    masked, expected = (
+        add(empty_predictions(2), returns, predicted, mask),
+        add(empty_predictions(2), returns[mask], predicted[mask]),
+    )
+    for a, b in zip(masked, expected, strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -6,17 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.credit_specs import observation_spec
-from helpers.decoder_toys import make_decoder
+from helpers.decoder_toys import decoder_rewards, fit_batches, make_decoder, observed_state, whole_batches
 from helpers.numpy_attention import numpy_coalitions, numpy_gelu, numpy_linear, numpy_mlp, numpy_time_layer
 from lare_rl.config.validity import check_credit
 from lare_rl.credit import decoder_state
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.credit.rewards import StepBatch, training_rewards
-from lare_rl.credit.spec import CreditSpec
 from lare_rl.credit.tar2 import return_shares
 from lare_rl.errors import LareError
-from lare_rl.nn.networks import adam_step, init_adam
 
 EPISODES, STEPS, AGENTS, OBSERVATIONS, ACTIONS = 2, 4, 3, 5, 2
 KEY = jax.random.key(1)
@@ -67,31 +67,17 @@ def test_output_against_numpy():
 def test_must_learn_contributions_and_actions():
     """The reward of an agent is its first entry. It acts by the sign of the mean second entry. Only returns are observed."""
     steps, agents, updates, n_episodes = 3, 2, 100, 32
-    decoder = make_decoder("tar2", {"observation": 2, "action": 2}, steps, agents)
     observation = np.random.default_rng(0).normal(size=(updates, n_episodes, steps, agents, 2))
     chosen = (observation[..., 1].mean(axis=-1, keepdims=True) > 0).astype(int).repeat(agents, axis=-1)
-    episodes = np.concatenate([observation, np.eye(2)[chosen]], axis=-1).astype(np.float32)
-    rows, reward = episodes.reshape(updates, -1, agents, 4), observation[..., 0]
-
-    def loss(decoder, rows, target, key):
-        output = decoder(rows, key)
-        mean = jnp.mean(output.r_hat.reshape(n_episodes, -1), axis=1)
-        return jnp.mean((mean - target) ** 2) + jnp.mean(output.penalty)
-
-    def body(state, inputs):
-        decoder, optimizer = state
-        return adam_step(decoder, jax.grad(loss)(decoder, *inputs), optimizer, 1e-3), None
-
-    @jax.jit
-    def train(decoder, *inputs):
-        decoder = jax.lax.scan(body, (decoder, init_adam(decoder, 1e-3)), inputs)[0][0]
-        return decoder(inputs[0][0], None).r_hat, decoder(inputs[0][0], KEY).penalty
-
-    target = (4 * np.sqrt(steps * agents) * reward.mean(axis=(2, 3))).astype(np.float32)
-    r_hat, penalty = map(np.asarray, train(decoder, rows, target, jax.random.split(KEY, updates)))
-    contributions = r_hat.reshape(n_episodes, steps, agents)
+    rows, reward = np.concatenate([observation, np.eye(2)[chosen]], axis=-1).astype(np.float32), observation[..., 0]
+    spec = observation_spec(2, METHODS["tar2"], CreditSettings(learning_rate=1e-3), steps, agents)
+    spec = replace(spec, method=METHODS["tar2"], action_size=2)
+    batches, flat = whole_batches(rows, reward.mean(axis=(2, 3, 4)), steps), rows[0].reshape(-1, agents, 4)
+    state = observed_state(spec, flat, batches.mean_reward[0], batches.length[0], KEY)
+    state, _ = fit_batches(state, batches, spec)
+    contributions = decoder_rewards(state, flat, spec).reshape(n_episodes, steps, agents)
     assert np.corrcoef(contributions.ravel(), reward[0].ravel())[0, 1] > 0.7
-    assert penalty.mean() < 0.05 * 0.5 * np.log(2)
+    assert state.network(jnp.asarray(flat), KEY).penalty.mean() < 0.05 * 0.5 * np.log(2)
     shares = np.asarray(shares_of(contributions, np.ones(contributions.shape, bool)))
     assert np.corrcoef(shares.ravel(), reward[0].ravel())[0, 1] > 0.4
 
@@ -105,17 +91,12 @@ def test_must_learn_contributions_and_actions():
     ],
 )
 def test_refusals(changes, words):
+    assert "exact" not in METHODS["tar2"].settings  # shares add up to the return already
     args = {"agents": AGENTS, "fixed_length": True, "discrete_actions": True} | changes
     is_discrete = args.pop("discrete_actions")
     spec = observation_spec(OBSERVATIONS, METHODS["tar2"], CreditSettings(), STEPS, **args)
     with pytest.raises(LareError, match=words):
         check_credit(spec, spec.agents, discrete_actions=is_discrete)
-
-
-def test_exact_is_no_setting():
-    """Shares add up to the return already."""
-    assert "exact" in METHODS["stas"].settings
-    assert "exact" not in METHODS["tar2"].settings
 
 
 def numpy_weights(values):
@@ -158,16 +139,8 @@ def test_shares_add_up(contributions, alive):
 
 def test_rewards_add_up_to_the_return():
     """The mean over the agents that are alive, summed over the steps, is the return, whatever the decoder gives."""
-    spec = CreditSpec(
-        method=METHODS["tar2"],
-        settings=CreditSettings(),
-        observation_size=2,
-        action_size=2,
-        single_agent=False,
-        agents=AGENTS,
-        max_steps=STEPS,
-        fixed_length=True,
-    )
+    spec = observation_spec(2, METHODS["tar2"], CreditSettings(), STEPS, AGENTS)
+    spec = replace(spec, method=METHODS["tar2"], action_size=2)
     rng = np.random.default_rng(0)
     alive = np.ones((2, 2 * STEPS, AGENTS), bool)
     alive[0, 2:STEPS, 1] = alive[1, 1:STEPS, :2] = False
@@ -178,13 +151,8 @@ def test_rewards_add_up_to_the_return():
     steps = StepBatch(inputs, np.full(returns.shape, STEPS), returns / STEPS, ended, last, alive)
     unfinished = steps._replace(episode_ended=~steps.episode_ended)  # the return is not known yet
 
-    @jax.jit
-    def compute(steps):
-        decoder = decoder_state.init(
-            jax.random.key(0), observation_spec(4, METHODS["rd"], CreditSettings(hidden=(4,)), STEPS, AGENTS)
-        )
-        return training_rewards(decoder, steps, spec)
-
+    small = observation_spec(4, METHODS["rd"], CreditSettings(hidden=(4,)), STEPS, AGENTS)
+    compute = jax.jit(lambda steps: training_rewards(decoder_state.init(jax.random.key(0), small), steps, spec))
     rewards, contributions = np.asarray(compute(jax.tree.map(lambda *pair: jnp.stack(pair), steps, unfinished)))
     step_rewards = rewards.sum(axis=-1) / np.maximum(alive.sum(axis=-1), 1)
     np.testing.assert_allclose(step_rewards.reshape(4, STEPS).sum(axis=1), returns[:, ::STEPS].ravel(), rtol=1e-4)

@@ -18,19 +18,11 @@ for env, env_rows in enumerate(ROWS):
         FIRST[env, start] = len(steps), np.mean([step[2] for step in steps], axis=0)
         start += len(steps)
 
-sample_transitions, sample_episodes, sample_distinct_episodes = (
-    jax.jit(function, static_argnums=2)
-    for function in (sampling.sample_transitions, sampling.sample_episodes, sampling.sample_distinct_episodes)
-)
-sample_packed, sample_episode_steps, sample_padded, episodes_in_order = (
-    jax.jit(function, static_argnums=static)
-    for function, static in (
-        (sampling.sample_packed, (2, 3, 4)),
-        (sampling.sample_episode_steps, (2, 3, 4)),
-        (sampling.sample_padded, (2, 3, 4)),
-        (sampling.episodes_in_order, (3, 4)),
-    )
-)
+ITEMS = sampling.sample_transitions, sampling.sample_episodes, sampling.sample_distinct_episodes
+CREDIT = sampling.sample_packed, sampling.sample_episode_steps, sampling.sample_padded
+sample_transitions, sample_episodes, sample_distinct_episodes = (jax.jit(item, static_argnums=2) for item in ITEMS)
+sample_packed, sample_episode_steps, sample_padded = (jax.jit(item, static_argnums=(2, 3, 4)) for item in CREDIT)
+episodes_in_order = jax.jit(sampling.episodes_in_order, static_argnums=(3, 4))
 
 
 @pytest.fixture(scope="module")
@@ -49,11 +41,8 @@ def assert_uniform(sampled, expected, deviations=6):
     np.testing.assert_allclose(counts, mean, atol=deviations * np.sqrt(mean))
 
 
-def test_sample_transitions_is_uniform(buffer):
+def test_samples_are_uniform(buffer):
     assert_uniform(pairs(sample_transitions(buffer, jax.random.key(0), (200, 500))), TRANSITIONS)
-
-
-def test_sample_episodes_is_uniform(buffer):
     episodes = jax.tree.map(np.asarray, sample_episodes(buffer, jax.random.key(0), (30_000,)))
     firsts = pairs(episodes.first)
     assert_uniform(firsts, FIRST)
@@ -123,7 +112,7 @@ def test_episodes_in_order(buffer):
     assert_packed(jax.tree.map(np.asarray, sample), expected[:2])
 
 
-def test_sample_episode_steps_has_steps_of_its_episodes(buffer):
+def test_sample_steps_and_padded_episodes(buffer):
     sample = jax.tree.map(np.asarray, sample_episode_steps(buffer, jax.random.key(0), 7, 6, 4))
     lengths = [FIRST[first][0] for first in pairs(sample.episodes.first)]
     assert 3 in lengths
@@ -135,14 +124,8 @@ def test_sample_episode_steps_has_steps_of_its_episodes(buffer):
         # An episode of three steps has three rows; its fourth row is padding.
         slots = sample.episode.reshape(42, 4)[i]
         assert slots.tolist() == [i % 6] * min(length, 4) + [6] * (4 - min(length, 4))
-
-
-def test_sample_padded_repeats_the_last_step(buffer):
     sample = sample_padded(buffer, jax.random.key(0), 5, 8, LONGEST)
-    expected = [
-        (env, first + min(t, FIRST[env, first][0] - 1))
-        for env, first in pairs(sample.episodes.first)
-        for t in range(LONGEST)
-    ]
+    firsts = pairs(sample.episodes.first)
+    expected = [(env, first + min(t, FIRST[env, first][0] - 1)) for env, first in firsts for t in range(LONGEST)]
     assert pairs(sample.steps) == expected
     np.testing.assert_array_equal(sample.episode, np.tile(np.repeat(np.arange(8), LONGEST), (5, 1)))

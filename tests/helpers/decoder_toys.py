@@ -1,12 +1,15 @@
 """Decoders for tests, and what their losses have in common (`from helpers.decoder_toys import ...`)."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lare_rl.credit import decoder_state, descent
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.input_names import InputNames
 from lare_rl.credit.methods import METHODS
@@ -58,3 +61,36 @@ def train_by_loss(decoder, rows, target, learning_rate):
         return jax.lax.scan(body, (decoder, init_adam(decoder, learning_rate)), batches)[0][0]
 
     return train(decoder, rows, target, jax.random.split(jax.random.key(0), len(rows)))
+
+
+@partial(jax.jit, static_argnames="spec")
+def observed_state(spec, rows, mean_reward, length, key):
+    """Return an untrained decoder that has observed these steps, and the mean rewards of episodes."""
+    state = decoder_state.observe_steps(decoder_state.init(key, spec), rows)
+    return decoder_state.observe_returns(state, mean_reward, length, jnp.ones(len(length), bool), None)
+
+
+def whole_batches(rows, mean_reward, length):
+    """Return batches of episodes. The first axes of the rows are updates, episodes, and the steps of an episode that are read."""
+    updates, n_episodes, n_steps = rows.shape[:3]
+    return CreditBatch(
+        inputs=rows.reshape(updates, n_episodes * n_steps, *rows.shape[3:]),
+        episode_index=np.tile(np.repeat(np.arange(n_episodes), n_steps), (updates, 1)),
+        length=np.full((updates, n_episodes), length),
+        mean_reward=np.broadcast_to(mean_reward, (updates, n_episodes)).astype(np.float32),
+        mask=np.ones((updates, n_episodes), np.float32),
+    )
+
+
+@partial(jax.jit, static_argnames="spec")
+def fit_batches(state, batches, spec):
+    """Make an update by each of some batches. Return the state and the losses."""
+
+    def body(state, batch):
+        state, metrics = descent.update(state, *batch, spec)
+        return state, metrics["credit/loss"]
+
+    return jax.lax.scan(body, state, (batches, jax.random.split(jax.random.key(0), len(batches.length))))
+
+
+decoder_rewards = jax.jit(decoder_state.decoder_rewards, static_argnames="spec")

@@ -35,16 +35,10 @@ def scripted(*replies, **options):
 
 
 QUICK_TASKS = ("CompetitivePP-6", "HalfCheetah-v4", "Reacher-v4", "TriangleArea")
+TASKS = [name for name in shipped_tasks() if read_task(name).family != "smac"]  # which has to be installed by hand
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        name if name in QUICK_TASKS else long_case(name)
-        for name in shipped_tasks()
-        if read_task(name).family != "smac"  # which has to be installed by hand
-    ],
-)
+@pytest.mark.parametrize("name", [name if name in QUICK_TASKS else long_case(name) for name in TASKS])
 def test_shipped_task(name):
     spec = read_task(name)
     if module := {"playground": "mujoco_playground", "jumanji": "jumanji"}.get(spec.family):
@@ -71,8 +65,13 @@ def test_draws_and_kinds():
     with pytest.raises(LareError, match=r"'Chase'.*model=.*--model NAME.*--function phi\.py.*bayes") as error:
         design(toy_spec())
     assert "\n" not in str(error.value)
-    with pytest.raises(LareError, match="1 or 5 candidates"):
-        design(task, candidates=3)
+    for candidates, words in ((3, "have 1 or 5 candidates"), (0, "= 0"), (101, "= 101")):
+        with pytest.raises(LareError, match=words):
+            design(task, candidates=candidates)
+    model = scripted(GOOD)
+    with pytest.raises(LareError, match="nothing/Here-v0"):  # the environment is checked first
+        design(toy_spec(environment="nothing/Here-v0"), model=model, candidates=1)
+    assert model.replies == [GOOD]
 
 
 def test_error_goes_back(chase):
@@ -107,11 +106,16 @@ def test_correction_request(chase, bad, quote, errors):
     assert [exchange["stage"] for exchange in function.exchanges] == ["candidate", "correct"]
 
 
-def test_surrogates_go_back_as_an_error(chase, tmp_path):
+def test_requests_of_surrogates_and_of_a_reward(chase, tmp_path):
     model = scripted(GOOD.replace('""', '"\\ud800"', 1), "\ud800", GOOD)
-    function = design(chase, model=model, candidates=1)
+    design(chase, model=model, candidates=1).save(tmp_path / "phi.py")
     assert "surrogate" in model.requests[1][-1]["content"]
-    function.save(tmp_path / "phi.py")
+    model = scripted(GOOD, to_reply(phi_source("return [action]")))
+    function = design(chase, "reward", model=model, candidates=1)
+    error = verify(PHI, chase, "reward").errors
+    request = candidate(chase, "reward")
+    assert model.requests == [request, correct(request, GOOD, error)]
+    assert (function.kind, function.size) == ("reward", 1)
 
 
 def test_passing_candidates_are_combined(chase):
@@ -121,29 +125,15 @@ def test_passing_candidates_are_combined(chase):
     assert model.requests[-1] == combine(chase, [GOOD, OTHER])
     assert function.exchanges[0]["replies"] == candidates
     assert messages == [
-        "candidate 1: passes",
-        f"candidate 2: {error_text('no_idea')}",
-        f"candidate 3: {NOT_JSON}",
-        "candidate 4: passes",
-        "attempt 1: passes",
+        *("candidate 1: passes", f"candidate 2: {error_text('no_idea')}", f"candidate 3: {NOT_JSON}"),
+        *("candidate 4: passes", "attempt 1: passes"),
     ]
-
-
-def test_all_candidates_are_combined_if_none_passes(chase):
+    # If none passes, all are combined.
     two_errors = to_reply("import os\n" + phi_source("return [action, np.two(3)]"))
     model, messages = scripted(MALFORMED, two_errors, "x" * (MAX_QUOTE + 5), GOOD), []
     design(chase, model=model, candidates=3, on_message=messages.append)
     assert model.requests[-1] == combine(chase, [MALFORMED, two_errors, "x" * MAX_QUOTE])
     assert messages[1].endswith("(and 1 more)")
-
-
-def test_reward_has_its_own_request_and_check(chase):
-    model = scripted(GOOD, to_reply(phi_source("return [action]")))
-    function = design(chase, "reward", model=model, candidates=1)
-    error = verify(PHI, chase, "reward").errors
-    request = candidate(chase, "reward")
-    assert model.requests == [request, correct(request, GOOD, error)]
-    assert (function.kind, function.size) == ("reward", 1)
 
 
 def test_attempts_end(chase):
@@ -178,9 +168,6 @@ def test_record(chase, tmp_path):
     assert path.read_text(encoding="utf-8") == content
 
 
-# --- without pre-verification, as an ablation ------------------------------------------------------------------------
-
-
 def test_without_pre_verification(chase):
     source = phi_source("return [action * np.nan, action]")
     assert not verify(source, chase).passed
@@ -190,17 +177,9 @@ def test_without_pre_verification(chase):
     assert function.checks == (Check("read", True),)
     assert function.names == ["factor_1", "action"]
     assert model.requests[-1] == combine(chase, [failing_reply("a"), GOOD])
-
-
-@pytest.mark.parametrize(
-    "text", [MALFORMED, to_reply("import os\nos.listdir('/')"), to_reply(phi_source("return action"))]
-)
-def test_unreadable_reply_without_pre_verification(chase, text):
-    with pytest.raises(DesignError, match="cannot be read"):
-        design(chase, model=scripted(text), candidates=1, pre_verification=False)
-
-
-# --- a model or an environment that fails ----------------------------------------------------------------------------
+    for text in (MALFORMED, to_reply("import os\nos.listdir('/')"), to_reply(phi_source("return action"))):
+        with pytest.raises(DesignError, match="cannot be read"):
+            design(chase, model=scripted(text), candidates=1, pre_verification=False)
 
 
 @pytest.mark.parametrize(("error", "status"), [(LareError("no model"), 2), (KeyboardInterrupt(), 130)])
@@ -212,16 +191,3 @@ def test_replies_survive_an_error(chase, error, status):
     with pytest.raises(type(error)) as raised:
         design(chase, model=scripted(error=error), candidates=3)
     assert raised.value is error
-
-
-def test_environment_is_checked_first():
-    model = scripted(GOOD)
-    with pytest.raises(LareError, match="nothing/Here-v0"):
-        design(toy_spec(environment="nothing/Here-v0"), model=model, candidates=1)
-    assert model.replies == [GOOD]
-
-
-@pytest.mark.parametrize(("arguments", "words"), [({"candidates": 0}, "= 0"), ({"candidates": 101}, "= 101")])
-def test_invalid_arguments(chase, arguments, words):
-    with pytest.raises(LareError, match=words):
-        design(chase, **arguments)

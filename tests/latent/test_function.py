@@ -24,12 +24,19 @@ def test_verify_function(verified, chase):
     assert verify_function(f"\n{PHI}\n", chase) == verified
 
 
-def test_factors(function):
+def test_factors_and_pickle(function):
     observation, action = np.array([[1, 9], [0.5, 9]], np.float32), np.array([[3], [-0.5]], np.float32)
     factors = function(observation, action)
     assert factors.dtype == np.float32
     np.testing.assert_array_equal(factors, [[-4, -9], [-1, -0.25]])
     np.testing.assert_array_equal(function(observation[0], action[0]), factors[0])
+    other = pickle.loads(pickle.dumps(function))
+    assert other == function
+    assert hash(other) == hash(function)
+    assert "graph" not in other.__dict__
+    np.testing.assert_array_equal(other(observation, action), factors)
+    with pytest.raises(RefusedError, match="E-FORM"):
+        _ = replace(function, source="x = 1").graph
 
 
 @pytest.mark.parametrize(
@@ -47,13 +54,9 @@ def test_step_factors(function, scored_observation, columns, expected):
     assert function.n_factors(scored_observation) == len(columns)
     empty = function.step_factors(np.zeros((0, 2)), np.zeros((0, 1)), np.zeros((0, 2)), scored_observation)
     assert empty.shape == (0, len(columns))
-
-
-@pytest.mark.parametrize("scored_observation", ["before", "both"])
-def test_step_factors_of_any_batch_axes(function, scored_observation):
     observation, action = np.arange(12.0).reshape(2, 3, 2), np.arange(6.0).reshape(2, 3, 1)
     factors = function.step_factors(observation, action, -observation, scored_observation)
-    assert factors.shape == (2, 3, function.n_factors(scored_observation))
+    assert factors.shape == (2, 3, len(columns))
     row = function.step_factors(observation[1, 0], action[1, 0], -observation[1, 0], scored_observation)
     np.testing.assert_array_equal(factors[1, 0], row)
 
@@ -101,39 +104,18 @@ def test_factor_that_is_not_finite_in_use(chase):
     assert str(pickle.loads(pickle.dumps(error.value))) == str(error.value)
 
 
-def test_names_and_meanings(function):
+def test_names_meanings_features_and_source(function):
     assert function.names == ["f_near", "f_effort"]
     assert function.meanings == ["how near the action comes", "effort"]
     source = phi_source("# Factor 1: energy,\n# squared\nenergy = action**2\nreturn [-energy, energy]")
     other = replace(function, source=source)
     assert other.names == ["factor_1", "energy"]
     assert other.meanings == ["", "energy, squared"]
-
-
-def test_features_read(function):
     assert function.features_read == [{"observation": [0], "action": [0]}, {"observation": [], "action": [0]}]
     assert function.reads == ["observation[0], action[0]", "action[0]"]
     assert features_text({"observation": [], "action": []}) == "nothing"
     indices = {"observation": [8, 9, 13], "action": [0, 1, 2, 3, 4, 5]}
     assert features_text(indices) == "observation[8:10, 13], action[0:6]"
-
-
-def test_unreadable_source_has_no_graph(function):
-    with pytest.raises(RefusedError, match="E-FORM"):
-        _ = replace(function, source="x = 1").graph
-
-
-def test_pickle(function):
-    observation, action = np.zeros((2, 2), np.float32), np.ones((2, 1), np.float32)
-    function(observation, action)
-    other = pickle.loads(pickle.dumps(function))
-    assert other == function
-    assert hash(other) == hash(function)
-    assert "graph" not in other.__dict__
-    np.testing.assert_array_equal(other(observation, action), function(observation, action))
-
-
-def test_normalise_source():
     assert normalise_source("# lare: x\r\n\n  y\rz\x0c\x85\n\n") == "  y\nz\x0c\x85"
     assert normalise_source("x  # \u26a0\ufe0f sign") == "x  # \u26a0 sign"
     assert normalise_source("# lare: \n\n" * 60_000 + "\nx\n\n") == "x"  # quadratic time would take minutes

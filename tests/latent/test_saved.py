@@ -21,7 +21,7 @@ def path(function, tmp_path):
     return tmp_path / "phi.py"
 
 
-def test_saved_files(function, path):
+def test_save_and_load(function, path, verified, chase):
     header = [
         "task: Chase",
         "kind: factors",
@@ -31,13 +31,17 @@ def test_saved_files(function, path):
     ]
     assert path.read_text() == "".join(f"# lare: {line}\n" for line in header) + SOURCE + "\n"
     assert json.loads(path.with_suffix(".json").read_text())["exchanges"] == list(function.exchanges)
-
-
-def test_load_function(function, chase, path):
     content = path.read_text()
     assert load_function(path.with_suffix(".json"), chase) == load_function(path, chase) == function
     load_function(path, chase).save(path)
     assert path.read_text() == content
+    path.with_suffix(".json").unlink()
+    assert load_function(path, chase).model == function.model
+    path.write_text(PHI)
+    assert load_function(path, chase) == verified
+    path.write_text(content.replace("[f_near, f_effort]", "[f_near, effort]"))
+    with pytest.raises(LareError, match=r"phi\.py: .*'Chase': E-RUN line 8: effort"):
+        load_function(path, chase)
 
 
 @pytest.mark.parametrize(
@@ -49,28 +53,23 @@ def test_load_what_was_saved(chase, path, source, kind):
     assert load_function(path, chase) == function
 
 
-def test_load_function_without_record(function, verified, chase, path):
-    path.with_suffix(".json").unlink()
-    assert load_function(path, chase).model == function.model
-    path.write_text(PHI)
-    assert load_function(path, chase) == verified
-
-
-def test_function_of_another_task(chase, path):
+def test_other_task_and_names_of_models(chase, path, function):
     other = chase.model_copy(update={"name": "Depot"})
     with pytest.raises(LareError, match=r"phi\.py .*'Chase', not for 'Depot'.*\"# lare: task: Chase\""):
         load_function(path, other)
     path.write_text(path.read_text().replace("# lare: task: Chase\n", ""))
     assert load_function(path, other).task == "Depot"
+    replace(function, model="x\nimport os\r\x85import sys\u2028#").save(path)
+    assert load_function(path, chase).source == function.source
+    assert path.read_text().splitlines()[2] == "# lare: model: x import os import sys #"
+    replace(function, model="m\udcff").save(path)  # a name that no file can have
+    assert load_function(path, chase) == replace(function, model="m\\udcff")
 
 
-def test_read_source(path, tmp_path):
+def test_read_source_and_reply_of_a_chat(path, tmp_path, chase):
     assert read_source(path) == read_source(path.with_suffix(".json")) == (SOURCE, False, "Chase")
     path.write_text("\ufeff\n\nno Python\n", encoding="utf-8")
     assert read_source(path) == ("no Python", False, None)
-
-
-def test_reply_of_a_chat(chase, tmp_path):
     reply = json.dumps({"Understand": "", "Analyze": "", "Functions": PHI})
     path = tmp_path / "reply.json"
     path.write_text(f"Here it is:\n```json\n{reply}\n```\n")
@@ -106,29 +105,17 @@ def test_header_in_a_reply(chase, path, top):
     assert (loaded.kind, loaded.source, loaded.changed) == ("factors", SOURCE, False)
 
 
-def test_model_name_is_no_code(function, chase, path):
-    replace(function, model="x\nimport os\r\x85import sys\u2028#").save(path)
-    assert load_function(path, chase).source == function.source
-    assert path.read_text().splitlines()[2] == "# lare: model: x import os import sys #"
-
-
-def test_model_name_that_no_file_can_have(function, chase, path):
-    replace(function, model="m\udcff").save(path)
-    assert load_function(path, chase) == replace(function, model="m\\udcff")
-
-
-@pytest.mark.parametrize(
-    ("name", "file"), [("phi", "phi.py"), ("phi.json", "phi.py"), ("phi.v2", "phi.v2.py"), ("phi-0.5.py", "phi-0.5.py")]
-)
-def test_names_of_files(function, tmp_path, name, file):
-    function.save(tmp_path / name)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([file, file.replace(".py", ".json")])
-
-
-def test_load_function_verifies(chase, path):
-    path.write_text(path.read_text().replace("[f_near, f_effort]", "[f_near, effort]"))
-    with pytest.raises(LareError, match=r"phi\.py: .*'Chase': E-RUN line 8: effort"):
-        load_function(path, chase)
+def test_names_of_files(function, tmp_path, monkeypatch):
+    names = {"a": "a.py", "b.json": "b.py", "phi.v2": "phi.v2.py", "phi-0.5.py": "phi-0.5.py"}
+    for name, file in names.items():
+        function.save(tmp_path / name)
+        assert (tmp_path / file).exists()
+        assert (tmp_path / file).with_suffix(".json").exists()
+    assert len(list(tmp_path.iterdir())) == 2 * len(names)
+    monkeypatch.chdir(tmp_path)
+    for path, words in (("none/phi.py", "cannot be written"), ("", "not the name"), ("..", "not the name")):
+        with pytest.raises(LareError, match=words):
+            function.save(path)
 
 
 @pytest.mark.parametrize(
@@ -153,23 +140,13 @@ def test_unreadable_file(chase, tmp_path, name, content, words):
 
 @pytest.mark.parametrize(
     "record",
-    ["{", "{}", "[" * 20_000, "[]"]
-    + [
-        f'{{"source": {values}}}'
-        for values in ('"", "model": null, "exchanges": []', '"", "model": "m", "exchanges": 3')
-    ]
-    + ['{"source": "\\ud800", "model": "m", "exchanges": []}'],
+    [
+        *("{", "{}", "[" * 20_000, "[]", '{"source": "", "model": null, "exchanges": []}'),
+        '{"source": "", "model": "m", "exchanges": 3}',
+        '{"source": "\\ud800", "model": "m", "exchanges": []}',
+    ],
 )
 def test_broken_record(chase, path, record):
     path.with_suffix(".json").write_text(record)
     with pytest.raises(LareError, match=r"phi\.json is not the record of a latent function"):
         load_function(path, chase)
-
-
-@pytest.mark.parametrize(
-    ("path", "words"), [("none/phi.py", "cannot be written"), ("", "not the name"), ("..", "not the name")]
-)
-def test_unwritable_file(verified, tmp_path, monkeypatch, path, words):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(LareError, match=words):
-        verified.save(path)

@@ -75,14 +75,9 @@ def test_verify_advice_is_no_error(chase):
     )
     verdict = verify(phi_source(body), chase)
     assert verdict.passed
-    assert [(advice.split()[1], advice.split()[2]) for advice in verdict.advice] == [
-        ("'unit'", "never"),
-        ("'ones'", "reads"),
-        ("'again'", "repeats"),
-    ]
-
-
-def test_verify_no_advice_for_factors_that_are_nearly_the_same(chase):
+    remarks = [tuple(advice.split()[1:3]) for advice in verdict.advice]
+    assert remarks == [("'unit'", "never"), ("'ones'", "reads"), ("'again'", "repeats")]
+    # None for factors that are nearly the same.
     body = "curved = np.sign(action) * np.abs(action)**1.5\nfaint = 1 + 1e-3 * observation\nreturn [action, curved, faint[:, 0:1]]"
     assert verify(phi_source(body), chase).advice == ()
 
@@ -94,9 +89,6 @@ def test_verify_recorded_combination(name):
     verdict = verify(source, read_task(recording.task), recording.kind)
     assert verdict.errors == ""
     assert verdict.passed
-
-
-# --- steps to try a function on --------------------------------------------------------------------------------------
 
 
 def test_random_steps(chase):
@@ -119,25 +111,19 @@ PARALLEL = {"environment": "pettingzoo/helpers.parallel_toy_envs:Toy", "observat
 """The second entry of an observation is the step within an episode of five steps."""
 
 
-def test_random_steps_without_agents_that_have_left():
-    # One agent acts at each step, and the other one at two steps of an episode.
-    observation, action = random_steps(toy_spec(**PARALLEL, arguments={"leaves": {"a_1": 2}}), 70)
-    assert np.bincount(observation[:, 1].astype(int)).tolist() == [20, 20, 10, 10, 10]
-    np.testing.assert_array_equal(action.sum(axis=1), 1)
-
-
-@pytest.mark.parametrize(
-    ("scored_observation", "counts"),
-    [("before", [14, 14, 14, 14, 14]), ("after", [0, 14, 14, 14, 14, 14]), ("both", [7, 14, 14, 14, 14, 7])],
-)
-def test_random_steps_of_scored_observation(scored_observation, counts):
-    observation, _ = random_steps(toy_spec(**PARALLEL, scored_observation=scored_observation), 70)
-    assert np.bincount(observation[:, 1].astype(int)).tolist() == counts
-
-
-def test_random_steps_of_an_agent_that_never_acts(monkeypatch):
+def test_random_steps_of_many_agents(monkeypatch):
+    """Observations before or after a step. Agents that have left do not count: one acts at each step, the other at two of five."""
+    for changes, counts in (
+        ({"scored_observation": "before"}, [14, 14, 14, 14, 14]),
+        ({"scored_observation": "after"}, [0, 14, 14, 14, 14, 14]),
+        ({"scored_observation": "both"}, [7, 14, 14, 14, 14, 7]),
+        ({"arguments": {"leaves": {"a_1": 2}}}, [20, 20, 10, 10, 10]),
+    ):
+        observation, action = random_steps(toy_spec(**PARALLEL, **changes), 70)
+        assert np.bincount(observation[:, 1].astype(int)).tolist() == counts
+        np.testing.assert_array_equal(action.sum(axis=1), 1)
     monkeypatch.setattr(verify_module, "_MAX_PLAYED_STEPS", 50)
-    team = toy_spec(**PARALLEL, arguments={"joins": {"a_1": 9}}, agents=("a_1",), team="late")
+    team = toy_spec(**PARALLEL, arguments={"joins": {"a_1": 9}}, agents=("a_1",), team="late")  # it never acts
     with pytest.raises(LareError, match="no agent of Chase"):
         random_steps(team, 10)
 

@@ -6,8 +6,7 @@ from helpers.numpy_attention import numpy_attention, numpy_layer_norm
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 
 
-@pytest.mark.parametrize("batch", [(), (3, 2)])
-@pytest.mark.parametrize("queries", [4, 7])
+@pytest.mark.parametrize(("batch", "queries"), [((), 4), ((3, 2), 7)])
 def test_attend_against_numpy(batch, queries):
     rng = np.random.default_rng(0)
     query, key, value = (rng.normal(size=(*batch, tokens, 2, 3)).astype(np.float32) for tokens in (queries, 4, 4))

@@ -45,22 +45,16 @@ def test_standardise():
     for factor in (1e-3, 1e3):
         other = standardise(observe(rows * factor), jnp.asarray(rows * factor))
         np.testing.assert_allclose(scaled, other, atol=1e-3)
-
-
-def test_standardise_if_observed():
+    for constant in (0.0, 1e9, -1e-9):
+        rows = jnp.full((50, 1), constant)
+        assert not standardise(update_mean_std(observe(rows), rows), rows).any()
     rows, statistics = jnp.array([[3.0, -70.0]]), observe(np.array([[1.0, 2.0], [3.0, 6.0]], np.float32))
     np.testing.assert_array_equal(normalise.standardise_if_observed(normalise.empty_mean_std(2), rows), rows)
     want = standardise(statistics, rows)
     np.testing.assert_array_equal(normalise.standardise_if_observed(statistics, rows), want)
 
 
-def test_constant_feature_becomes_zero():
-    for constant in (0.0, 1e9, -1e-9):
-        rows = jnp.full((50, 1), constant)
-        assert not standardise(update_mean_std(observe(rows), rows), rows).any()
-
-
-def test_root_mean_square():
+def test_scale():
     scale = normalise.empty_scale()
     assert float(normalise.root_mean_square(scale)) == 1.0
     scale = update_scale(scale, jnp.zeros(4), jnp.zeros(4, bool))
@@ -68,9 +62,6 @@ def test_root_mean_square():
     scale = update_scale(scale, jnp.array([3.0, 100.0]), jnp.array([True, False]))
     scale = update_scale(scale, jnp.array([4.0, 5.0]), jnp.array([True, True]))
     assert float(normalise.root_mean_square(scale)) == pytest.approx(np.sqrt((9 + 16 + 25) / 3))
-
-
-def test_min_max_scale():
     scale = update_scale(normalise.empty_scale(), jnp.array([3.0]), jnp.array([False]))
     assert (float(scale.lowest), float(scale.highest)) == (0, 0)
     scale = update_scale(scale, jnp.array([3.0, 9.0, -5.0]), jnp.array([True, False, False]))

@@ -77,8 +77,7 @@ def test_rows_come_back(moves, tmp_path_factory):
 OLD_NAMES = {"next_transition": "transitions", "current_episode": "episodes", "n_effective": "n_determined"}
 
 
-@pytest.mark.parametrize("payments", [PAID_AT_END, PaymentRule(period=4)])
-@pytest.mark.parametrize("method", ["bayes", "ircr"])
+@pytest.mark.parametrize(("method", "payments"), [("bayes", PaymentRule(period=4)), ("ircr", PAID_AT_END)])
 def test_learner_comes_back(method, payments, tmp_path):
     """Also from an earlier version. No field has the old name of another, so none is renamed when it is read."""
     config = small_config(method, payments=payments)
@@ -92,29 +91,15 @@ def test_learner_comes_back(method, payments, tmp_path):
     with np.load(tmp_path / "state.npz") as saved:
         arrays = {re.sub(r"(?<=\.)\w+", lambda m: OLD_NAMES.get(m[0], m[0]), name): saved[name] for name in saved.files}
     if method == "ircr":  # it had only a scale
-        expected = {
-            name: values for name, values in expected.items() if ".decoders[" not in name or "[0].scale." in name
-        }
-        arrays = {
-            name.replace(".decoders[0].scale.", ".scale[0]."): values
-            for name, values in arrays.items()
-            if ".decoders[" not in name or "[0].scale." in name
-        }
+        names = [name for name in arrays if ".decoders[" not in name or "[0].scale." in name]
+        arrays = {name.replace(".decoders[0].scale.", ".scale[0]."): arrays[name] for name in names}
+        expected = {name: values for name, values in expected.items() if name in names}
     np.savez(tmp_path / "state.npz", **arrays)
     loaded = checkpoint.named_leaves(checkpoint.load(tmp_path, shape)[0])
     jax.tree.map(np.testing.assert_array_equal, {name: loaded[name] for name in expected}, expected)
 
 
-def test_row_file_before_dropped_episode_is_kept(tmp_path):
-    """At row 40 of 100, the episode since row 10 is dropped: rows 0 to 40 are used for longer than row 10 alone."""
-    rows = np.arange(100.0)
-    for end in (0, 40, 10, 60, 125):
-        save(tmp_path / "checkpoint", rows, end)
-    learner, _, _ = checkpoint.load(tmp_path / "checkpoint", template(1, 1, 100))
-    np.testing.assert_array_equal(learner.replay.columns["reward"][0, 0, 25:], rows[25:].astype(np.float32))
-
-
-def test_files_of_killed_process_are_removed(tmp_path):
+def test_files_of_killed_process_and_best_policies(tmp_path):
     directory = tmp_path / "checkpoint"
     save(directory, np.zeros(CAPACITY), 3)
     for name in ("rows-1.npz.0123.new", "rows-7.npz", "best.npz.0123.new"):
@@ -125,43 +110,42 @@ def test_files_of_killed_process_are_removed(tmp_path):
     assert {path.name for path in directory.iterdir()} == expected
     save_best(directory, update_best(empty_best(1), np.ones(1), 5, np.zeros((1, 2))))
     assert {path.name for path in directory.glob("best*")} == {"best.npz"}
-
-
-def test_nan_is_never_the_best_evaluation():
-    best = empty_best(2)
+    with pytest.raises(LareError, match=r"state\.npz/checkpoint cannot be written"):
+        save(directory / "state.npz" / "checkpoint", np.zeros(CAPACITY), 3)
+    best = empty_best(2)  # NaN is never the best evaluation, and equal ones are not better
     for step, returns in ((1, [np.nan, -3.0]), (2, [-5.0, np.nan]), (3, [-5.0, -4.0])):
         best = update_best(best, np.array(returns), step, np.full((2, 1), step))
     assert [array.tolist() for array in best] == [[-5.0, -3.0], [2, 1], [[2], [1]]]
 
 
-def test_rows_that_are_dropped_at_once_are_not_written(tmp_path):
+def test_row_files_of_dropped_episodes(tmp_path):
+    """Rows that are dropped at once are not written."""
     save(tmp_path / "checkpoint", np.arange(16.0), 3)
     save(tmp_path / "checkpoint", np.arange(16.0), 5000)
     with np.load(tmp_path / "checkpoint" / "rows-1.npz") as rows:
         assert rows["reward"].shape == (1, 1, CAPACITY)
     learner, _, _ = checkpoint.load(tmp_path / "checkpoint", template(1, 1, CAPACITY))
     np.testing.assert_array_equal(learner.replay.columns["reward"][0, 0], np.arange(16))
+    # At row 40 of 100, the episode since row 10 is dropped: rows 0 to 40 are used for longer than row 10 alone.
+    rows = np.arange(100.0)
+    for end in (0, 40, 10, 60, 125):
+        save(tmp_path / "longer", rows, end)
+    learner, _, _ = checkpoint.load(tmp_path / "longer", template(1, 1, 100))
+    np.testing.assert_array_equal(learner.replay.columns["reward"][0, 0, 25:], rows[25:].astype(np.float32))
 
 
-def test_parent_that_is_a_file_is_reported(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(LareError, match="file/checkpoint cannot be written"):
-        save(tmp_path / "file" / "checkpoint", np.zeros(CAPACITY), 3)
+@pytest.mark.parametrize(("name", "metadata"), [("state.npz", None), ("rows-0.npz", {"step": 3})])
+def test_truncated_file_is_refused(name, metadata, tmp_path):
+    save(tmp_path, np.zeros(CAPACITY), 3)
+    content = (tmp_path / name).read_bytes()
+    for n_bytes in (1, 100, 200):
+        (tmp_path / name).write_bytes(content[:n_bytes])
+        with pytest.raises(LareError, match=r"state\.npz cannot be read"):
+            checkpoint.load(tmp_path, template(1, 1, CAPACITY))
+        assert checkpoint.read_metadata(tmp_path) == metadata
 
 
-@pytest.mark.parametrize("n_bytes", [1, 100, 200])
-@pytest.mark.parametrize("name", ["state.npz", "rows-0.npz"])
-def test_truncated_file_is_refused(name, n_bytes, tmp_path):
-    directory = tmp_path / "checkpoint"
-    save(directory, np.zeros(CAPACITY), 3)
-    (directory / name).write_bytes((directory / name).read_bytes()[:n_bytes])
-    with pytest.raises(LareError, match=r"state\.npz cannot be read"):
-        checkpoint.load(directory, template(1, 1, CAPACITY))
-    host = checkpoint.read_metadata(directory)
-    assert (host is None) if name == "state.npz" else (host == {"step": 3})
-
-
-def test_replay_of_extended_run_may_be_larger(tmp_path):
+def test_larger_replay_and_missing_arrays(tmp_path):
     save(tmp_path / "checkpoint", np.arange(1.0, CAPACITY + 1), 9)
     with pytest.raises(LareError, match=r"\.replay\.row has shape \(1, 1, 16\), not \(1, 1, 12\)"):
         checkpoint.load(tmp_path / "checkpoint", template(1, 1, CAPACITY - 4))
@@ -169,8 +153,6 @@ def test_replay_of_extended_run_may_be_larger(tmp_path):
     np.testing.assert_array_equal(learner.replay.columns["reward"][0, 0], [*range(1, 11), *[0] * 10])
     np.testing.assert_array_equal(learner.replay.row[0, 0], [*range(CAPACITY), *[0] * 4])
 
-
-def test_arrays_that_earlier_checkpoints_lack_are_zero():
     class Closed(NamedTuple):
         strengths: Any
         weight: Any

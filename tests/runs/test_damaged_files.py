@@ -35,9 +35,6 @@ def refusal(read, *arguments) -> str:
     return str(error.value)
 
 
-# config.json
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -71,9 +68,7 @@ def test_config_content(tmp_path, content, message):
 )
 def test_config_values(tmp_path, changes, message):
     settings = json.loads((write_changed_run(tmp_path) / "config.json").read_text())["settings"]
-    changes = {
-        name: {**settings, **value} if name == "settings" and value else value for name, value in changes.items()
-    }
+    changes = {name: settings | value if name == "settings" else value for name, value in changes.items()}
     assert message in refusal(open_run, write_changed_run(tmp_path, **changes))
 
 
@@ -82,9 +77,6 @@ def test_html_is_escaped(tmp_path):
     page = write_report([run]).read_text("utf-8")
     assert "<script" not in page
     assert "<img" not in page
-
-
-# metrics.jsonl
 
 
 @pytest.mark.parametrize(
@@ -117,9 +109,6 @@ def test_metrics_size_and_incomplete_line(tmp_path, monkeypatch):
     assert "metrics.jsonl is larger than 1 MB" in refusal(read_metrics, tmp_path)
 
 
-# state.npz
-
-
 class Replay(NamedTuple):
     columns: Any
     next_row: Any
@@ -133,12 +122,8 @@ def make_learner(next_row):
     return Learner(Replay({"reward": jnp.zeros((1, 1, 16))}, jnp.full((1, 1), next_row)))
 
 
-def load(directory: Path):
-    return checkpoint.load(directory, make_learner(0))
-
-
 def check_refused(directory: Path, message: str = "") -> None:
-    text = refusal(load, directory)
+    text = refusal(checkpoint.load, directory, make_learner(0))
     assert text.startswith(f"the checkpoint {directory / 'state.npz'} cannot be read: ")
     assert message in text
 
@@ -146,9 +131,8 @@ def check_refused(directory: Path, message: str = "") -> None:
 @pytest.fixture
 def directory(tmp_path) -> Path:
     """A checkpoint."""
-    directory = tmp_path / "checkpoint"
-    checkpoint.write(directory, checkpoint.take_snapshot(directory, make_learner(3), {"step": 3}, {}))
-    return tmp_path / "checkpoint"
+    checkpoint.write(tmp_path, checkpoint.take_snapshot(tmp_path, make_learner(3), {"step": 3}, {}))
+    return tmp_path
 
 
 def host(**values) -> np.ndarray:
@@ -211,27 +195,18 @@ def test_state_with_false_header(directory, content):
     check_refused(directory)
 
 
-def test_state_zip_bomb(directory):
+def test_state_that_is_no_plain_archive(directory):
+    content = bytearray((directory / "state.npz").read_bytes())
     with zipfile.ZipFile(directory / "state.npz", "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("latest/more.npy", header((1 << 24,)) + b"\0" * (8 << 24))
     check_refused(directory, "latest/more.npy is compressed")
     assert checkpoint.read_metadata(directory) is None
-
-
-def test_encrypted_state(directory):
-    content = bytearray((directory / "state.npz").read_bytes())
     content[content.index(b"PK\x01\x02") + 8] |= 1
     (directory / "state.npz").write_bytes(content)
     check_refused(directory, "encrypted")
-
-
-@pytest.mark.parametrize("content", [b"", b"PK", b"PK\x03\x04" + b"\xff" * 99, header((0,)), b"\x80\x04."])
-def test_state_that_is_no_archive(directory, content):
-    (directory / "state.npz").write_bytes(content)
-    check_refused(directory, "no .npz file")
-
-
-# Sweeps and task files
+    for content in (b"", b"PK", b"PK\x03\x04" + b"\xff" * 99, header((0,)), b"\x80\x04."):
+        (directory / "state.npz").write_bytes(content)
+        check_refused(directory, "no .npz file")
 
 
 @pytest.mark.parametrize("read", [read_task, read_sweep])

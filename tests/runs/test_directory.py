@@ -28,7 +28,7 @@ def run(tmp_path):
     return create_run(tmp_path / "run", toy_spec(), settings, [verify_function(PHI, toy_spec())])
 
 
-def test_open_run_equals_created(run, monkeypatch):
+def test_open_run_equals_created_and_replaced_function(run, monkeypatch):
     opened = open_run(run.directory)
     assert opened.config == run.config
     assert opened.function.digest == run.function.digest
@@ -36,10 +36,7 @@ def test_open_run_equals_created(run, monkeypatch):
     assert {"jax", "python"} < set(run.config.versions)
     monkeypatch.setattr(config_file, "VERSIONED_PACKAGES", ("jax", "no-such-extra"))
     assert set(make_config(run.config.task, run.config.settings, []).versions) == {"jax", "python"}
-
-
-def test_function_that_was_replaced_during_run(run):
-    """Format 4 had runs that replaced phi. The checkpoint has the hash of the one in use."""
+    # Format 4 had runs that replaced phi. The checkpoint has the hash of the one in use.
     new = verify_function(PHI.replace("near", "close"), toy_spec())
     new.save(run.directory / "latent_function-600.py")
     assert open_run(run.directory).function.digest == run.function.digest
@@ -68,25 +65,16 @@ def test_metrics_are_parsed_once_per_file_state(run, monkeypatch):
     assert read_metrics(run.directory) == [line | {DETERMINISTIC_RETURN: 2.0}]
 
 
-METRIC = re.compile(r'"((?:evaluation|credit|critic|actor|time)/\w+)"')
-
-
-def test_every_metric_has_a_meaning():
-    files = Path(lare_rl.__file__).parent.rglob("*.py")
-    names = {name for path in files for name in METRIC.findall(path.read_text(encoding="utf-8"))}
+def test_metrics_have_a_meaning_and_the_lock_refuses_a_second_process(run):
+    metric, files = r'"((?:evaluation|credit|critic|actor|time)/\w+)"', Path(lare_rl.__file__).parent.rglob("*.py")
+    names = {name for path in files for name in re.findall(metric, path.read_text(encoding="utf-8"))}
     documented = {name for group in METRIC_GROUPS.values() for name in group}
     assert names - {"evaluation/won"} == documented - {"step", "seed"}  # tasks name their own measures
-
-
-def test_lock_refuses_second_process(run):
     with lock_run(run), pytest.raises(RunBusyError, match="another process"), lock_run(run):
         pass
     shutil.rmtree(run.directory)
     with pytest.raises(LareError, match="lock cannot be written"), lock_run(run):
         pass
-
-
-# Runs below a directory, as of a sweep
 
 
 def test_find_run_directories(make_run, tmp_path):
@@ -99,7 +87,7 @@ def test_find_run_directories(make_run, tmp_path):
     assert [path.resolve() for path in directories] == both[::-1]
 
 
-def test_logs_of_sweep_are_skipped(make_run):
+def test_logs_of_sweep_are_skipped_and_other_paths_refused(make_run, tmp_path):
     run = make_run("a-td3", [1.0])
     log = run.directory.with_name("a-td3.log")
     log.write_text("step 50")
@@ -108,11 +96,8 @@ def test_logs_of_sweep_are_skipped(make_run):
         find_run_directories([log])
     with pytest.raises(LareError, match=r"b\.log is not a run"):
         find_run_directories([run.directory, log.rename(log.with_name("b.log"))])
-
-
-@pytest.mark.parametrize(("name", "hint"), [("nothing", False), ("results.csv", True)])
-def test_other_paths_are_refused(name, hint, tmp_path):
     (tmp_path / "results.csv").touch()
-    with pytest.raises(LareError, match=f"{name} is not a run") as error:
-        find_run_directories([tmp_path / name])
-    assert ("docs/how-to/sweeps.md" in str(error.value)) == hint
+    for name, hint in (("nothing", False), ("results.csv", True)):
+        with pytest.raises(LareError, match=f"{name} is not a run") as error:
+            find_run_directories([tmp_path / name])
+        assert ("docs/how-to/sweeps.md" in str(error.value)) == hint

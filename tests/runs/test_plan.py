@@ -86,14 +86,10 @@ def test_options_win_over_the_file(write, monkeypatch, tmp_path):
     [
         ("stepz = 1", "there is no key 'stepz' (did you mean 'steps'?)"),
         ("tasks = 'x'", "there is no key 'tasks' (did you mean 'task'?)"),
-        ("td3 = { gama = 1 }", "there is no key 'td3.gama' (did you mean 'gamma'?)"),
         ("[settings]\nsteps = 1", "write the keys of [settings] outside of this table"),
         ("steps = 'many'", "steps = 'many': input should be a valid integer"),
-        ("steps = 0", "steps = 0: input should be greater than or equal to 1"),
-        ("method = 'lara'", "no method 'lara'; the methods are"),
         ("function = 1", "function = 1: "),
         ("task = 1", "task = 1: input should be a valid string"),
-        ("td3 = 1", "td3 = 1: should be a table of settings"),
         ("task = Reacher-v4", "a text needs quotes"),
     ],
 )
@@ -123,12 +119,6 @@ def test_files_that_cannot_be_used(write, command, name, text, words):
     assert words in err
 
 
-def test_resume_takes_no_file(write, command):
-    status, _, err = command("train", "--resume", "runs/x", "--config", write("steps = 100"))
-    assert status == 2
-    assert "--resume uses the run's settings" in err
-
-
 @pytest.fixture
 def trained(monkeypatch):
     """Return the arguments of each call of `lare_rl.train`."""
@@ -153,12 +143,15 @@ def test_command_trains_what_the_file_says(write, spec_file, command, trained, t
     assert (settings.steps, other_settings.method) == (250, "bayes")
     assert options["function"][0].source == PHI.strip("\n")
     assert other_options["function"] is None  # another method needs none
+    status, _, err = command("train", "--resume", "runs/x", "--config", path)
+    assert (status, "--resume uses the run's settings" in err) == (2, True)
 
 
-@pytest.mark.parametrize("method", METHODS)
+FOR_TOY = [name for name, row in METHODS.items() if not (row.multi_agent_only or row.decoder_kind.whole_episodes)]
+
+
+@pytest.mark.parametrize("method", FOR_TOY)
 def test_settings_of_a_run_are_those_of_its_repetition(method, phi, reward, tmp_path):
-    if METHODS[method].multi_agent_only or METHODS[method].decoder_kind.whole_episodes:
-        pytest.skip("a method for other tasks")
     task = toy_spec()
     settings = Settings(method=method, steps=240, rollout_steps=12, evaluate_every=60, seed=3, td3={"gamma": 0.9})
     resolved = resolve(settings, task)

@@ -59,15 +59,14 @@ def learned_training(phi, tmp_path_factory):
 def echo_settings(small_many):
     """An iteration has ten steps, an episode of echo three to six: iterations end in the middle of episodes."""
     changes = {"environments": 2, "rollout_steps": 10, "steps": 80, "evaluate_every": 20, "credit": QUICK_CREDIT}
-    return small_many(algorithm="ippo", method="lare-rd", scored_observation="both", **changes)
+    return small_many(algorithm="ippo", method="lare-linear", scored_observation="both", **changes)
 
 
 @pytest.fixture(scope="session")
 def echo_run(echo_settings, tmp_path_factory):
     """A run of agents that leave, in JAX."""
-    echo = echo_spec()
-    function = verify_function(ECHO_PHI, echo)
-    return train_quietly(echo, echo_settings, tmp_path_factory.mktemp("echo") / "run", function)
+    function = verify_function(ECHO_PHI, echo_spec())
+    return train_quietly(echo_spec(), echo_settings, tmp_path_factory.mktemp("echo") / "run", function)
 
 
 @pytest.fixture(scope="session")
@@ -79,6 +78,5 @@ def hosted_settings(small_many):
 @pytest.fixture(scope="session")
 def hosted_run(hosted_settings, tmp_path_factory):
     """The same toy, stepped on the host."""
-    return train_quietly(
-        echo_spec(environment="hosted/three"), hosted_settings, tmp_path_factory.mktemp("hosted") / "run"
-    )
+    out = tmp_path_factory.mktemp("hosted") / "run"
+    return train_quietly(echo_spec(environment="hosted/three"), hosted_settings, out)

@@ -38,28 +38,31 @@ gymnasium.register("toys/Wrapped-v0", entry_point=Wrapped, max_episode_steps=20,
 WRAPPED = toy_spec(environment="toys/Wrapped-v0")
 
 
-class Countdown(gymnasium.Wrapper):
-    """Episodes terminate after the next of some numbers of steps. Every reward is 1."""
+class Changed(gymnasium.Wrapper):
+    """Episodes of the next of some lengths, in which every reward is 1; and a bad output at the third step, for some seeds."""
 
-    def __init__(self, env, lengths):
+    def __init__(self, env, lengths=None, seeds=range(2**31), **bad):
         super().__init__(env)
-        self.lengths = lengths
+        self.lengths, self.seeds, self.bad = lengths, seeds, bad
 
     def reset(self, *, seed=None, options=None):
-        self.steps_left = next(self.lengths)
+        self.is_bad, self.steps, self.length = seed in self.seeds, 0, next(self.lengths) if self.lengths else None
         return self.env.reset(seed=seed)
 
     def step(self, action):
-        assert self.steps_left > 0, "stepped after the end"
-        self.steps_left -= 1
-        observation, _, _, truncated, _ = self.env.step(action)
-        return observation, 1.0, self.steps_left == 0, truncated, {"left": self.steps_left}
+        assert self.steps != self.length, "stepped after the end"
+        self.steps += 1
+        observation, reward, terminated, truncated, _ = self.env.step(action)
+        if self.length:
+            reward, terminated = 1.0, self.steps == self.length
+        output = {"observation": observation, "reward": reward} | (self.bad if self.is_bad and self.steps == 3 else {})
+        return *output.values(), terminated, truncated, {"left": (self.length or 0) - self.steps}
 
 
 @pytest.fixture
 def wrap(monkeypatch):
-    """Choose the wrapper of toys/Wrapped-v0."""
-    return lambda wrapper, **options: monkeypatch.setattr(Wrapped, "wrap", staticmethod(partial(wrapper, **options)))
+    """Choose how toys/Wrapped-v0 is changed."""
+    return lambda **options: monkeypatch.setattr(Wrapped, "wrap", staticmethod(partial(Changed, **options)))
 
 
 def local_envs(count, task=None):
@@ -80,9 +83,6 @@ def collect(envs, n_steps, noise=0.0):
     return envs.collect_by(best_policy, np.full((n_steps, *envs.shape, 1, 1), noise, np.float32))
 
 
-# Actions.
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @settings(max_examples=30, deadline=None)
 @given(low=st.lists(st.floats(-1e3, 1e3, width=32), min_size=1, max_size=3), width=st.floats(0.125, 1e3, width=32))
@@ -95,15 +95,6 @@ def test_to_env_action_stays_in_space(dtype, low, width):
         assert space.contains(to_env_action(np.full((1, len(low)), action, np.float32), spec)[0])
 
 
-def test_collect_stores_unclipped_action():
-    steps = collect(make_envs(), 5, noise=3)
-    assert (steps.action > 1).all()
-    np.testing.assert_array_equal(steps.env_action, 2)
-
-
-# Steps.
-
-
 def test_episode_seeds_of_streams_differ():
     seeds = {episode_seed(seed, stream, number) for seed in range(3) for stream in Stream for number in range(20)}
     assert len(seeds) == 3 * len(Stream) * 20
@@ -112,29 +103,26 @@ def test_episode_seeds_of_streams_differ():
 
 
 def test_collect_steps_are_consecutive():
-    n_envs = 3
-    steps = collect(make_envs(n_envs=n_envs), 45)
-    assert steps.timestep.observation.shape == (2, 45, n_envs, 1, 2)
+    steps, alone = collect(make_envs(n_envs=3), 45), collect(make_envs((1,), 3), 45)
+    assert steps.timestep.observation.shape == (2, 45, 3, 1, 2)
     inside = ~steps.ended[:, :-1]
-    np.testing.assert_array_equal(
-        steps.next_timestep.observation[:, :-1][inside], steps.timestep.observation[:, 1:][inside]
-    )
-    for seed_index, env_index in np.ndindex(2, n_envs):
+    after, before = steps.next_timestep.observation[:, :-1], steps.timestep.observation[:, 1:]
+    np.testing.assert_array_equal(after[inside], before[inside])
+    for seed_index, env_index in np.ndindex(2, 3):
         np.testing.assert_array_equal(np.flatnonzero(steps.ended[seed_index, :, env_index]), [19, 39])
+    # Initial states depend on the seed alone.
+    np.testing.assert_array_equal(alone.timestep.observation[0], steps.timestep.observation[1])
+    assert len(np.unique(steps.timestep.observation[:, [0, 20, 40]].reshape(-1, 2), axis=0)) == 18
     assert not steps.next_timestep.terminated.any()
     np.testing.assert_allclose(steps.env_action, 2 * steps.action, rtol=1e-4, atol=1e-6)
     expected = -((steps.env_action[..., 0] - steps.timestep.observation[..., 0]) ** 2)
     np.testing.assert_allclose(steps.next_timestep.reward, expected, rtol=1e-4, atol=1e-6)
+    beyond = collect(make_envs(), 5, noise=3)  # stored as chosen
+    assert (beyond.action > 1).all()
+    np.testing.assert_array_equal(beyond.env_action, 2)
 
 
-def test_collect_initial_states_depend_on_seed_alone():
-    steps, alone = collect(make_envs((0, 1), 3), 60), collect(make_envs((1,), 3), 60)
-    np.testing.assert_array_equal(alone.timestep.observation[0], steps.timestep.observation[1])
-    initial = steps.timestep.observation[:, [0, 20, 40]].reshape(-1, 2)
-    assert len(np.unique(initial, axis=0)) == 18
-
-
-def test_collect_tells_policy_episode_starts():
+def test_collect_tells_policy_episode_starts_and_overwrites_nothing():
     starts, envs = [], make_envs((0,), 2)
 
     def policy(timestep, noise, episode_start):
@@ -145,9 +133,6 @@ def test_collect_tells_policy_episode_starts():
         envs.collect_by(policy, np.zeros((n_steps, *envs.shape, 1, 1), np.float32))
     assert np.flatnonzero(np.array(starts) == 3).tolist() == [0, 20, 40]
     assert starts.count(0) == 38
-
-
-def test_collect_result_is_not_overwritten():
     envs = make_envs()
     results = collect(envs, 7), envs.state_dict()
     copies = jax.tree.map(np.copy, results)
@@ -157,16 +142,13 @@ def test_collect_result_is_not_overwritten():
 
 @pytest.mark.parametrize(("limit", "ends", "terminated"), [(5, [4, 9, 14, 19], []), (9, [6, 13], [6, 13])])
 def test_collect_distinguishes_termination(limit, ends, terminated, wrap):
-    wrap(Countdown, lengths=itertools.repeat(7))
+    wrap(lengths=itertools.repeat(7))
     steps = collect(make_envs((0,), task=WRAPPED.model_copy(update={"max_episode_steps": limit})), 20)
     np.testing.assert_array_equal(np.flatnonzero(steps.ended[0]), ends)
     np.testing.assert_array_equal(np.flatnonzero(steps.next_timestep.terminated[0]), terminated)
 
 
-# Restored episodes.
-
-
-def test_restore_drops_only_other_observations():
+def test_restore_drops_other_observations_and_episodes_that_end_early(wrap):
     envs, restored = make_envs((0, 4), 2), make_envs((0, 4), 2)
     collect(envs, 27)
     state = envs.state_dict()
@@ -176,17 +158,11 @@ def test_restore_drops_only_other_observations():
     state = restored.state_dict()
     assert state["episode"].tolist() == [1, 1, 1, 2]
     assert [len(state[f"actions{i}"]) for i in range(4)] == [7, 7, 7, 0]
-
-
-def test_restore_drops_episode_that_ends_early(wrap):
-    wrap(Countdown, lengths=iter((9, 2, 9)))
+    wrap(lengths=iter((9, 2, 9)))
     envs = make_envs((0,), task=WRAPPED)
     collect(envs, 5)
     dropped, _ = envs.restore(envs.state_dict())
     assert dropped.all()
-
-
-# Whole episodes.
 
 
 def proportional(factor):
@@ -230,7 +206,7 @@ def test_evaluated_episode_does_not_depend_on_the_number_of_environments():
 
 
 def test_evaluate_episodes_of_different_lengths(wrap):
-    wrap(Countdown, lengths=iter((3, 1, 7) * 2))
+    wrap(lengths=iter((3, 1, 7) * 2))
     envs = local_envs(3, WRAPPED.model_copy(update={"measures": ("left",)}))
     evaluation = evaluate_on_host(envs, proportional(0.0), [0], 3)
     np.testing.assert_array_equal(evaluation.returns[..., 0], [[3, 1, 7]])
@@ -246,18 +222,12 @@ def test_actions_are_random_until_the_end_of_the_warmup(monkeypatch):
     settings = SMALL_SETTINGS["td3"].model_copy(update={"warmup": 8})
     envs = local_envs(2)
     config = small_config("dense", env=envs.spec, hyperparameters=settings)
-    monkeypatch.setattr(
-        collect_host,
-        "make_host_policy",
-        lambda *arguments, **options: lambda memory, *inputs: (np.full((2, 1, 1, 1), 0.5, np.float32), memory),
-    )
+    half = np.full((2, 1, 1, 1), 0.5, np.float32)
+    monkeypatch.setattr(collect_host, "make_host_policy", lambda *_, **options: lambda memory, *inputs: (half, memory))
     collector = HostCollector(envs, local_envs(2), config, (0, 1))
     warmup, first = (collector.collect(None, step).action for step in (4, 8))
     assert len(np.unique(warmup)) == warmup.size == 8
     assert (first == 0.5).all()
-
-
-# Faults.
 
 
 def test_policy_that_is_nan_is_reported():
@@ -268,52 +238,30 @@ def test_policy_that_is_nan_is_reported():
         evaluate_on_host(local_envs(2), lambda timestep, episode_start: action, (0, 1), 1)
 
 
-class BadOutput(gymnasium.Wrapper):
-    """Returns a bad observation or reward at the third step, in episodes of some seeds."""
-
-    def __init__(self, env, value=None, seeds=range(2**31), reward=False):
-        super().__init__(env)
-        self.value, self.seeds, self.reward = value, seeds, reward
-
-    def reset(self, *, seed=None, options=None):
-        self.is_bad, self.steps = seed in self.seeds, 0
-        return super().reset(seed=seed, options=options)
-
-    def step(self, action):
-        observation, reward, *rest = super().step(action)
-        self.steps += 1
-        if self.is_bad and self.steps == 3:
-            return (observation, self.value, *rest) if self.reward else (self.value, reward, *rest)
-        return observation, reward, *rest
-
-
 def test_collect_locates_bad_outputs(wrap):
     """The reward in the second episode of the second environment of seed 9, which is the seed's episode number 3.
 
     The fourth environment of the run has a single number in the message.
     """
-    wrap(BadOutput, value=np.zeros(3))
+    wrap(observation=np.zeros(3))
     with pytest.raises(EnvOutputError, match=r"observation.*\(3,\).*, at step 3 of episode 0 of seed 4$"):
         collect(make_envs((4,), task=WRAPPED), 20)
     seed = episode_seed(9, Stream.TRAINING_EPISODES, 3)
-    wrap(BadOutput, value=float("nan"), seeds={seed}, reward=True)
+    wrap(reward=float("nan"), seeds={seed})
     with pytest.raises(
         EnvOutputError, match=r"^the environment: .*reward.*nan.*, at step 3 of episode 1 of seed 9 in environment 1$"
     ):
         collect(make_envs((4, 9), 2, task=WRAPPED), 40)
 
 
-def test_restore_locates_bad_outputs(wrap):
-    """The step is that of the repeated episode."""
+def test_restore_and_evaluate_locate_bad_outputs(wrap):
+    """The step is that of the repeated or evaluated episode."""
     envs = make_envs((4,), task=WRAPPED)
     collect(envs, 27)
-    wrap(BadOutput, value=float("nan"), reward=True)
+    wrap(reward=float("nan"))
     with pytest.raises(EnvOutputError, match=r"reward.*nan.*, at step 3 of episode 1 of seed 4$"):
         make_envs((4,), task=WRAPPED).restore(envs.state_dict())
-
-
-def test_evaluate_locates_bad_output(wrap):
-    wrap(BadOutput, value=float("nan"), seeds={episode_seed(1, Stream.EVALUATION_EPISODES, 2)}, reward=True)
+    wrap(reward=float("nan"), seeds={episode_seed(1, Stream.EVALUATION_EPISODES, 2)})
     envs = local_envs(4, WRAPPED)
     evaluate_on_host(envs, proportional(0.0), (0, 1), 2)
     with pytest.raises(EnvOutputError, match=r"nan.*, at step 3 of the episode, in an evaluation of seed 1$"):

@@ -26,18 +26,12 @@ def build(static, option=0):
     return object()
 
 
-def test_equal_arguments_share_result():
+def test_only_equal_arguments_share_a_result_until_it_is_forgotten():
     assert build(Static(np.arange(3))) is build(Static(np.arange(3)), option=0)
     assert build(Static({"a": (1, [2.0])})) is build(Static({"a": (1, [2.0])}))
-
-
-def test_different_arguments_do_not():
     values = (1, 1.0, True, "1", None, (1,), [1], np.arange(3), np.arange(3.0), np.arange(3).reshape(3, 1))
     assert len({id(build(Static(value))) for value in values}) == len(values)
     assert build(Static(1)) is not build(Static(1), option=1)
-
-
-def test_oldest_entries_are_forgotten():
     clear_compile_cache()
     first = build(0)
     for i in range(1, compile_cache.MAX_ENTRIES):

@@ -3,7 +3,6 @@
 In the first fit, held-out episodes are not fitted to, and each seed keeps its best decoder.
 """
 
-import signal
 from dataclasses import replace
 from functools import partial
 
@@ -12,8 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import lare_rl
-from helpers.listeners import metrics_without_times
 from helpers.numpy_twins import assert_close
 from helpers.small_configs import (
     ONE_AGENT,
@@ -25,20 +22,22 @@ from helpers.small_configs import (
     untrained_learner,
     with_factor_decoders,
 )
-from helpers.training_runs import resume_quietly, train_quietly
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.data import replay
-from lare_rl.envs.load import read_task
-from lare_rl.latent.function import verify_function
 from lare_rl.training import compiled, decoder_fits
 from lare_rl.training.decoder_fits import (
     PATIENCE,
+    FirstFitStoppedError,
     config_of_first_fit,
     fit_decoders,
     fit_seeds,
     fit_until_converged,
     sample_credit,
 )
+
+
+def stack_seeds(*seeds):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *seeds)
 
 
 def test_update_in_chunks_is_that_of_the_batch(monkeypatch):
@@ -57,13 +56,10 @@ def test_update_in_chunks_is_that_of_the_batch(monkeypatch):
 
 
 def test_seeds_are_fitted_at_once_or_one_after_the_other():
-    config = small_config("rd", fit_updates=2)
-    seeds = jax.tree.map(lambda *leaves: np.stack(leaves), *(learner_with_episodes(config, seed) for seed in (0, 1)))
-    results = []
-    for batched in (False, True):
-        fit = jax.jit(partial(fit_seeds, config=replace(config, batched=batched)))
-        results.append(fit(seeds, jax.random.split(jax.random.key(0))))
-    assert_close(*results, 1e-3, 1e-6)
+    config, keys = small_config("rd", fit_updates=2), jax.random.split(jax.random.key(0))
+    seeds = stack_seeds(*(learner_with_episodes(config, seed) for seed in (0, 1)))
+    fits = (jax.jit(partial(fit_seeds, config=replace(config, batched=batched))) for batched in (False, True))
+    assert_close(*(fit(seeds, keys) for fit in fits), 1e-3, 1e-6)
 
 
 @pytest.mark.parametrize(
@@ -79,39 +75,37 @@ def test_seeds_are_fitted_at_once_where_that_is_much_faster(backend, seconds, ex
 # The first fit.
 
 
-@pytest.mark.parametrize(
-    ("n_episodes", "n_held_out"),
-    [
+def test_count_held_out_and_config_of_first_fit():
+    """It reads an eighth of the steps."""
+    for n_episodes, n_held_out in (
         ((10,), [2]),
         ((1,) * 10, [0] * 8 + [1] * 2),
         ((3, 3, 3, 3), [0, 0, 0, 2]),
         ((4, 0, 6), [0, 0, 2]),
         ((999,), [32]),
-    ],
-)
-def test_count_held_out(n_episodes, n_held_out):
-    buffer = replay.init_replay({}, len(n_episodes), 100, 1)._replace(current_episode=jnp.array(n_episodes))
-    assert decoder_fits._count_held_out(buffer, window=32).tolist() == n_held_out
-
-
-def stack_seeds(*seeds):
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *seeds)
+    ):
+        buffer = replay.init_replay({}, len(n_episodes), 100, 1)._replace(current_episode=jnp.array(n_episodes))
+        assert decoder_fits._count_held_out(buffer, window=32).tolist() == n_held_out
+    for steps, first in ((6400, 800), (400, 50), (80, 12), (10, 10)):
+        config = small_config("lare-rd", credit=CreditSettings(steps=steps))
+        assert config_of_first_fit(config).credit.steps == first
 
 
 def test_fit_until_converged_keeps_the_best_decoders():
     """The only factor is the true reward, so a decoder's error is the distance of its weight from 1."""
     config = small_config("lare-linear", "ippo", ONE_TEAM, n_factors=(1,), n_envs=10)
     steps = random_steps(ONE_TEAM, 10, lengths=(12,))
-    learner = add_steps(untrained_learner(config), config, steps, steps.next_timestep.reward[..., None])
+    learner = add_steps(untrained_learner(config), config, steps, steps.next_timestep.reward[..., None], learn=False)
+    fitted = learner.decoders[0].closed_form._replace(n_fitted=jnp.array(2.0))  # only then returns are predicted
+    learner = learner._replace(decoders=(learner.decoders[0]._replace(closed_form=fitted),))
     errors, rounds = [[3.0, 3.0], [1.0, 4.0], [2.0, 2.0], [5.0, 5.0], [0.0, 6.0]], []
 
     def fit(learner, keys):
         seeds = [jax.tree.map(lambda leaf, seed=seed: leaf[seed], learner) for seed in (0, 1)]
         pairs = zip(seeds, errors[len(rounds)], strict=True)
         fitted = stack_seeds(*[with_factor_decoders(seed, [1 + error]) for seed, error in pairs])
-        rounds.append(
-            (np.asarray(learner.replay.current_episode).sum(axis=1).tolist(), jax.random.key_data(keys).tolist())
-        )
+        n_episodes = np.asarray(learner.replay.current_episode).sum(axis=1).tolist()
+        rounds.append((n_episodes, jax.random.key_data(keys).tolist()))
         return fitted, {"credit/loss": jnp.array(errors[len(rounds) - 1])}
 
     keys = jax.random.split(jax.random.key(0), 2)
@@ -124,31 +118,5 @@ def test_fit_until_converged_keeps_the_best_decoders():
     np.testing.assert_array_equal(fitted.replay.current_episode, [learner.replay.current_episode] * 2)
     np.testing.assert_array_equal(fitted.replay.running, [learner.replay.running] * 2)
     np.testing.assert_array_equal(metrics["credit/loss"], [1.0, 2.0])
-
-
-@pytest.mark.parametrize(("steps", "first"), [(6400, 800), (400, 50), (80, 12), (10, 10)])
-def test_config_of_first_fit_reads_an_eighth_of_the_steps(steps, first):
-    config = small_config("lare-rd", credit=CreditSettings(steps=steps))
-    assert config_of_first_fit(config).credit.steps == first
-
-
-PHI = "def evaluation_func(o, a):\n    return [np.sum(np.square(o[:, 4:8]), axis=1, keepdims=True), o[:, 0:1]]"
-
-
-@pytest.mark.long
-def test_resume_after_a_stop_during_the_first_fit(small_many, tmp_path, monkeypatch):
-    task = read_task("CN-6")
-    changes = {"environments": 12, "steps": 600, "evaluate_every": 300, "capacity": 2000, "first_fit": "held-out"}
-    settings, function = small_many(method="lare-rd", seeds=1, **changes), verify_function(PHI, task)
-    uninterrupted = train_quietly(task, settings, tmp_path / "uninterrupted", function)
-
-    def request_stop(learner):
-        signal.raise_signal(signal.SIGINT)
-        return True
-
-    with monkeypatch.context() as patch:
-        patch.setattr(decoder_fits, "has_enough_episodes", request_stop)
-        with pytest.raises(lare_rl.LareError, match=r"first fit.*--resume"):
-            train_quietly(task, settings, tmp_path / "run", function)
-    resumed = resume_quietly(tmp_path / "run")
-    assert metrics_without_times(resumed) == metrics_without_times(uninterrupted)
+    with pytest.raises(FirstFitStoppedError):
+        fit_until_converged(stack_seeds(learner, learner), fit, keys, config, lambda: True)

@@ -5,14 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from helpers.small_configs import (
-    ONE_TEAM,
-    TOTAL,
-    random_factors,
-    random_steps,
-    small_config,
-    steps_as_stored,
-)
+from helpers.small_configs import ONE_TEAM, TOTAL, random_factors, random_steps, small_config, steps_as_stored
 from lare_rl.training.decoder_inputs import decoder_inputs
 
 MANY = partial(small_config, algorithm="ippo", env=ONE_TEAM)

@@ -16,15 +16,16 @@ from lare_rl.training.explain import compile_explanation, explain_run, explain_s
 from lare_rl.training.saved_state import load_learner
 
 SOURCE = "def evaluation_func(o, a):\n    return [o[:, 0:1] * a[:, 0:1], o[:, 1:2]]\n"
+SHARES = "of the variation of the returns of"
 
 
 def check_explanation(run, messages):
     method, lines = run.config.settings.method, explain_run(run)
-    assert any("of the variation of the returns of" in line for line in lines)
+    assert any(SHARES in line for line in lines)
     legend = [MESSAGES[code] for code in LEGEND_CODES]
     assert all(messages.count(text) == lines.count(text) for text in legend)  # once, though returns are explained twice
-    n_explanations = sum("of the variation of the returns of" in message for message in messages)
-    assert sum(message.startswith("Provisional") for message in messages) == n_explanations - 1
+    n_provisional = sum(message.startswith("Provisional") for message in messages)
+    assert n_provisional == sum(SHARES in message for message in messages) - 1
     lines = [line for line in lines if line not in legend]
     assert [message for message in messages if message not in legend][-len(lines) :] == lines
     assert (f"not the decoder of {method}" in lines[0]) == (method != "lare-bayes")

@@ -22,12 +22,10 @@ GRID += [long_case("qmix", method) for method in ("lare-rd", "dense", "ircr", "r
 GRID += [long_case("qmix", method) for method in ("llm-reward", "stas")]
 GRID += [long_case("ppo", method) for method in ("arel", "lare-linear", "dense", "rrdu", "diaster")]
 GRID += [long_case("ddpg", "rrdu"), long_case("sac", "lare-rrdu"), long_case("vdn", "lare-rd")]
-"""The first tier has what the other whole runs have not: a decoder's own loss, whole episodes, two teams, refusals. In
-the second tier, every method runs with one algorithm, the cheapest. The other rows are pairs, so that each kind of
-reward, each way to fit, and raw features and factors meet each way to consume steps."""
+"""The first tier has refusals. In the second tier, every method runs with one algorithm, the cheapest. The other rows are
+pairs, so that each kind of reward, each way to fit, and raw features and factors meet each way to consume steps."""
 
-STATE_GRID = [("observation", "arel"), ("state", "stas"), ("state", "lare-rd-shared"), long_case("state", "rrdu")]
-STATE_GRID += [long_case("observation", "lare-rrdu"), long_case("state", "lare-linear")]
+STATE_GRID = [("state", "rrdu"), ("observation", "lare-rrdu"), ("state", "lare-linear")]
 
 
 def make_functions(method, task):
@@ -70,22 +68,16 @@ def test_method_trains_or_is_refused(algorithm, method_name, small, small_many, 
         assert lare_rl.write_report([run.directory]).read_text().count("<svg") >= 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("credit_scope", "method_name"), STATE_GRID)
 def test_method_with_agents_that_leave(credit_scope, method_name, small_many, echo, tmp_path):
-    method, from_state = METHODS[method_name], credit_scope == "state"
-    changes = {"credit_scope": "state", "observation_size": 9, "action_size": 9} if from_state else {}
-    task = echo.model_copy(update=changes)
-    settings = small_many(
-        method=method_name, algorithm="qmix", seeds=1, steps=100, rollout_steps=25, credit=QUICK_CREDIT
+    method = METHODS[method_name]
+    changes = {"credit_scope": "state", "observation_size": 9, "action_size": 9} if credit_scope == "state" else {}
+    task, quick = (
+        echo.model_copy(update=changes),
+        {"seeds": 1, "steps": 100, "rollout_steps": 25, "credit": QUICK_CREDIT},
     )
-
-    def train():
-        return train_quietly(task, settings, tmp_path / "run", make_functions(method, task))
-
-    if method.decoder_kind.whole_episodes or (method.multi_agent_only and from_state):
-        with pytest.raises(LareError, match=f"^{method_name} (reads whole episodes|assigns credit among agents)"):
-            train()
-        return
-    line = train().metrics()[-1]
+    settings = small_many(method=method_name, algorithm="qmix", **quick)
+    line = train_quietly(task, settings, tmp_path / "run", make_functions(method, task)).metrics()[-1]
     assert np.isfinite(line["critic/loss"])
     assert ("credit/error" in line) == method.calibrated

@@ -53,25 +53,6 @@ def update_once(learner, config, key=0):
     return jitted(fit_decoders, config)(learner.decoders, learner.replay, sample, jax.random.key(1))
 
 
-# A single agent
-
-
-@pytest.mark.parametrize("method", ["rd", *map(long_case, ("rrd", "rrdu", "vib-rd", "vib-rrdu"))])
-def test_fit_ignores_padding(method):
-    config = small_config(method)
-    learner = learner_with_episodes(config)
-    sample = jax.tree.map(lambda leaf: leaf[0], sample_credit(learner.replay, jax.random.key(2), 1, config))
-    padding = np.asarray(sample.episode) >= len(sample.episodes.length)
-    assert padding.any()
-    changed = sample._replace(steps=sample.steps._replace(number=jnp.where(padding, 40, sample.steps.number)))
-    assert (np.asarray(sample.steps.number) != changed.steps.number).any()
-    updates = (
-        jitted(fit_decoders, config)(learner.decoders, learner.replay, batch, jax.random.key(0))
-        for batch in (sample, changed)
-    )
-    assert_close(*updates, 1e-5, 1e-7)
-
-
 @pytest.mark.parametrize(
     ("method", "scale_rewards"),
     [("dense", True), ("lare-rrdu", False), long_case("lare-rrdu", True), ("llm-reward", True)],
@@ -94,20 +75,6 @@ def test_rewards(method, scale_rewards):
             assert reward.std() > 0
 
 
-def with_running_episode(config):
-    """Return a learner with a running episode of two steps, and the learner without it."""
-    learner, steps = learner_with_episodes(config), jax.tree.map(lambda rows: rows[:2], random_steps(config.env))
-    return add_steps(learner, config, steps), learner
-
-
-def test_ircr_pays_half_until_an_episode_ends():
-    config = small_config("ircr")
-    learner, _ = with_running_episode(config)
-    reward = jitted(rewards, config)(stored_steps(learner), learner.decoders)[:, 0]
-    np.testing.assert_array_equal(reward[-2:], [0.5, 0.5])
-    assert float(reward[0]) != 0.5
-
-
 def check_closed_form(credit, z, reward):
     """Check the sums over episodes, weighted by their steps, of standardised factors, R/T and R. NaN: no agent was alive."""
     decoder = credit.closed_form.decoder
@@ -122,14 +89,6 @@ def check_closed_form(credit, z, reward):
     np.testing.assert_allclose(sums.products, (length * centred.T) @ centred, rtol=1e-3, atol=1e-4)
 
 
-def test_abandon_episodes_does_not_change_the_fit():
-    config = small_config("lare-linear")
-    longer, learner = with_running_episode(config)
-    shorter = abandon_episodes(longer, jnp.array([True]))
-    jax.tree.map(np.testing.assert_array_equal, shorter.decoders[0].closed_form, learner.decoders[0].closed_form)
-    assert shorter.replay.next_transition.tolist() == learner.replay.next_transition.tolist()
-
-
 def test_assess_reads_the_newest_steps():
     # The factor is the true reward of the newest ten steps, and far from it before.
     config, steps = small_config("lare-linear", n_factors=(1,), rollout_steps=10), random_steps()
@@ -138,13 +97,10 @@ def test_assess_reads_the_newest_steps():
     learner = with_factor_decoders(add_steps(untrained_learner(config), config, steps, factors, learn=False), [1.0])
     # With a fixed length, only the newest iteration is measured.
     same_length = replace(config, env=replace(config.env, fixed_length=True))
-    newest, recent = jitted(assess, same_length)(learner), jitted(assess, config)(learner)
-    assert float(newest["credit/error"]) == pytest.approx(0.5, rel=1e-5)
-    assert float(newest["credit/correlation"]) == pytest.approx(1, rel=1e-4)
-    assert float(recent["credit/error"]) == pytest.approx((7 * (TOTAL - 10) + 5) / TOTAL, rel=1e-5)
-
-
-# Many agents
+    for reader, error in ((same_length, 0.5), (config, (7 * (TOTAL - 10) + 5) / TOTAL)):
+        metrics = jitted(assess, reader)(learner)
+        assert float(metrics["credit/error"]) == pytest.approx(error, rel=1e-5)
+        assert reader is config or float(metrics["credit/correlation"]) == pytest.approx(1, rel=1e-4)
 
 
 def test_teams_have_separate_decoders_and_returns():
@@ -162,11 +118,19 @@ def test_teams_have_separate_decoders_and_returns():
         assert not jax.tree.all(jax.tree.map(jnp.array_equal, before.network, after.network))
 
 
+def with_running_episode(config):
+    """Return a learner with a running episode of two steps, and the learner without it."""
+    learner, steps = learner_with_episodes(config), jax.tree.map(lambda rows: rows[:2], random_steps(config.env))
+    return add_steps(learner, config, steps), learner
+
+
 @pytest.mark.parametrize("method", ["episodic", "ircr"])
 def test_rewards_of_teams(method):
+    """ircr pays half until an episode ends."""
     config, steps = TEAMS(method), random_steps(TWO_TEAMS)
-    learner, alive = learner_with_episodes(config), steps.timestep.alive[:, 0]
+    (learner, _), alive = with_running_episode(config), steps.timestep.alive[:, 0]
     reward = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.decoders))
+    np.testing.assert_array_equal(reward[TOTAL:], alive[:2] * (0.5 if method == "ircr" else 0))
     assert not alive.all()
     for team in TWO_TEAMS.teams:
         episode_rewards = np.split(team_rewards(steps, team), ENDS)
@@ -176,7 +140,8 @@ def test_rewards_of_teams(method):
         else:
             means = np.array([episode.mean() for episode in episode_rewards])
             expected = np.repeat((means - means.min()) / (means.max() - means.min()), LENGTHS)[:, None]
-        np.testing.assert_allclose(reward[:, team.agents], expected * alive[:, team.agents], rtol=1e-3, atol=1e-5)
+        expected = expected * alive[:, team.agents]
+        np.testing.assert_allclose(reward[:TOTAL, team.agents], expected, rtol=1e-3, atol=1e-5)
 
 
 def test_rewards_of_each_agent_and_shared_among_agents_that_are_alive():
@@ -204,22 +169,25 @@ def test_assess_measures_each_team():
     alive = steps.timestep.alive
     factors = np.where(alive, steps.next_timestep.reward, 1e3)[..., None]
     learner = add_steps(untrained_learner(config), config, steps, factors, learn=False)
-    learner = with_factor_decoders(learner, [1.0, -1.0])
-    results = jitted(assess, config)(learner)
-    assert {name: round(float(value), 3) for name, value in results.items() if "correlation" in name} == {
-        "credit/correlation": 1,
-        "credit/correlation_first": 1,
-        "credit/correlation_second": -1,
+    results = {
+        name: float(value) for name, value in jitted(assess, config)(with_factor_decoders(learner, [1.0, -1.0])).items()
     }
-    assert float(results["credit/error"]) == float(results["credit/error_first"]) == pytest.approx(0, abs=1e-6)
-    true, mask = steps.next_timestep.reward[..., 3:], alive[..., 3:]
-    assert float(results["credit/error_second"]) == pytest.approx(2 * np.abs(true[mask]).mean(), rel=1e-4)
+    assert [results[f"credit/correlation{team}"] for team in ("", "_first", "_second")] == pytest.approx([1, 1, -1])
+    error = 2 * np.abs(steps.next_timestep.reward[..., 3:][alive[..., 3:]]).mean()
+    errors = [results[f"credit/error{team}"] for team in ("", "_first", "_second")]
+    assert errors == pytest.approx([0, 0, error], rel=1e-4, abs=1e-6)
 
 
 def test_closed_form_sums_means_over_alive_agents_of_finished_episodes():
+    """To abandon a running episode changes nothing."""
     config, steps = TEAMS("lare-linear"), random_steps(TWO_TEAMS)
-    factors, (learner, _) = random_factors(config, steps), with_running_episode(config)
-    for credit, team, size in zip(learner.decoders, TWO_TEAMS.teams, config.n_factors, strict=True):
+    factors, (longer, learner) = random_factors(config, steps), with_running_episode(config)
+    shorter = abandon_episodes(longer, jnp.array([True]))
+    assert shorter.replay.next_transition.tolist() == learner.replay.next_transition.tolist()
+    for credit, team, size, before in zip(
+        shorter.decoders, TWO_TEAMS.teams, config.n_factors, learner.decoders, strict=True
+    ):
+        jax.tree.map(np.testing.assert_array_equal, credit.closed_form, before.closed_form)
         all_rows, alive = factors[:, 0, team.agents, :size], steps.timestep.alive[:, 0, team.agents]
         rows = [
             z[mask].mean(axis=0) if mask.any() else [np.nan] * size for z, mask in zip(all_rows, alive, strict=True)
@@ -232,28 +200,17 @@ def test_closed_form_sums_means_over_alive_agents_of_finished_episodes():
 def test_must_learn_which_agent_earned_the_reward(method, fixed_length):
     # One of two factors is the true reward of the agent. The decoder is fitted to the mean over agents and steps.
     env = EnvSpec((Team("all", 0, 3),), 3, 4, True, 12, agents_leave=not fixed_length, fixed_length=fixed_length)
-    config = MANY(
-        method,
-        env=env,
-        n_envs=8,
-        fit_updates=500,
-        credit=CreditSettings(hidden=(16,), learning_rate=1e-2, steps=200, sampled_steps=6),
-        capacity=200,
-        rollout_steps=60,
-    )
-    lengths = (12,) * 5 if fixed_length else LENGTHS
-    steps = random_steps(env, 8, lengths=lengths)
-    noise = np.random.default_rng(0).normal(size=steps.next_timestep.reward.shape).astype(np.float32)
-    learner = add_steps(
-        untrained_learner(config), config, steps, np.stack([steps.next_timestep.reward, noise], axis=-1)
-    )
+    credit = CreditSettings(hidden=(16,), learning_rate=1e-2, steps=200, sampled_steps=6)
+    config = MANY(method, env=env, n_envs=8, fit_updates=500, credit=credit, capacity=200, rollout_steps=60)
+    steps = random_steps(env, 8, lengths=(12,) * 5 if fixed_length else LENGTHS)
+    reward = steps.next_timestep.reward
+    factors = np.stack([reward, np.random.default_rng(0).normal(size=reward.shape).astype(np.float32)], axis=-1)
+    learner = add_steps(untrained_learner(config), config, steps, factors)
     decoders, _ = jax.jit(partial(fit_repeatedly, config=config))(learner, jax.random.key(2))
     results = jitted(assess, config)(learner._replace(decoders=decoders))
     assert float(results["credit/correlation"]) > 0.9
     assert float(results["credit/error"]) < 0.35  # untrained, it is 0.8 and more
 
-
-# Agents that leave
 
 OTHERS = ("rd", "rrdu", "vib-rd", "lare-rrdu", "lare-signs", "lare-rd-shared", "llm-reward")
 
@@ -273,16 +230,13 @@ def test_values_of_dead_agents_change_nothing(method):
     assert_close(*results)
 
 
-# Credit to whole teams, by the global state
-
-
-def team_level_config(method, **changes):
-    return MANY(method, credit_scope="state", **changes)
+TEAM_LEVEL = partial(MANY, credit_scope="state")
+"""Credit to whole teams, by the global state."""
 
 
 @pytest.mark.parametrize("method", ["rrdu", *map(long_case, ("rd", "rd-linear", "lare-rd", "llm-reward"))])
 def test_team_level_rewards_are_the_same_for_all_alive_agents(method):
-    config = team_level_config(method, n_factors=(2,) if method[0] == "l" else ())
+    config = TEAM_LEVEL(method, n_factors=(2,) if method[0] == "l" else ())
     learner, alive = learner_with_episodes(config), random_steps(ONE_TEAM).timestep.alive[:, 0]
     reward = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.decoders))
     team_reward = reward.sum(axis=1) / np.maximum(alive.sum(axis=1), 1)
@@ -296,7 +250,7 @@ def test_team_level_rewards_are_the_same_for_all_alive_agents(method):
 
 
 def test_team_level_closed_form_and_assess():
-    config, steps = team_level_config("lare-linear", n_factors=(1,)), random_steps(ONE_TEAM)
+    config, steps = TEAM_LEVEL("lare-linear", n_factors=(1,)), random_steps(ONE_TEAM)
     reward = team_rewards(steps, ONE_TEAM.teams[0]).astype(np.float32)
     factors = 0.5 + reward[:, None, None, None]
     learner = add_steps(untrained_learner(config), config, steps, factors)

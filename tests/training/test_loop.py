@@ -6,6 +6,7 @@ import time
 import numpy as np
 import pytest
 
+from helpers.listeners import MessageListener
 from helpers.toy_envs import toy_spec
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
@@ -15,7 +16,6 @@ from lare_rl.runs.directory import Run
 from lare_rl.training import session as sessions
 from lare_rl.training import train as training
 from lare_rl.training.decoder_fits import FirstFitStoppedError
-from lare_rl.training.progress import Listener
 from lare_rl.training.session import Session
 
 
@@ -24,10 +24,8 @@ class EmptySession(Session):
     is_closed = False
 
     def __init__(self, directory, **attributes):
-        settings = resolve(
-            Settings(method="dense", steps=36, rollout_steps=12, evaluate_every=12, evaluation_episodes=1), toy_spec()
-        )
-        self.run = Run(directory, make_config(toy_spec(), settings, ()), ())
+        settings = Settings(method="dense", steps=36, rollout_steps=12, evaluate_every=12, evaluation_episodes=1)
+        self.run = Run(directory, make_config(toy_spec(), resolve(settings, toy_spec()), ()), ())
         self.latest_metrics = {}
         vars(self).update(attributes)
 
@@ -49,12 +47,10 @@ class EmptySession(Session):
         self.is_closed = True
 
 
-class Recorder(Listener):
+class Recorder(MessageListener):
     def __init__(self, fails=False):
-        self.messages, self.fails, self.n_stops = [], fails, 0
-
-    def on_message(self, message):
-        self.messages.append(message)
+        super().__init__()
+        self.fails, self.n_stops = fails, 0
 
     def on_stop(self):
         self.n_stops += 1

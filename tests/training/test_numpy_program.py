@@ -55,14 +55,15 @@ def test_policy_on_host_equals_compiled_policy(algorithm, monkeypatch):
     config = small_config("dense", algorithm, hyperparameters=hyperparameters)
     learner = init_seeds(compile_functions(config), seed_keys(jnp.arange(2), 0))
     actor = policy.get_actor(learner.algorithm, 0, config)
-    inputs = (), draw(2, 3, 1, 3), np.ones((2, 3, 1, 2), bool)
+    inputs, greedy = ((), draw(2, 3, 1, 3), np.ones((2, 3, 1, 2), bool)), None
     for deterministic in (True, False):
-        noise = None if deterministic else draw(2, 3, 1, config.noise_size)
+        noise, results = None if deterministic else draw(2, 3, 1, config.noise_size), []
         assert policy._translate_policy(config, 2, 3, deterministic) is not None
-        results = []
         for _ in range(2):
             act = policy.make_host_policy(config, actor, 3, deterministic=deterministic)
             results.append(act(*inputs, noise, np.zeros((2, 3), bool))[0])
             monkeypatch.setattr(policy, "_translate_policy", lambda *_: None)
         np.testing.assert_allclose(*results, atol=1e-6)
+        assert greedy is None or np.abs(results[0] - greedy).max() > 0.01  # the policy explores
+        greedy = results[0]
         monkeypatch.undo()

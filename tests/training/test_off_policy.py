@@ -60,12 +60,8 @@ def test_train_step_updates_once_for_each_step(monkeypatch):
     jax.effects_barrier()
     assert sorted(int(update_index) for update_index, *_ in batches) == list(range(10, 10 + 3 * envs))
 
-    def merge_envs(rows):
-        return rows.reshape(-1, *rows.shape[2:])
-
-    observation, next_observation = map(merge_envs, (steps.timestep.observation, steps.next_timestep.observation))
-    terminated, reward = steps.next_timestep.terminated.ravel(), steps.next_timestep.reward.ravel()
-    n_terminated = 0
+    observation, next_observation = (t.observation.reshape(-1, 1, 3) for t in (steps.timestep, steps.next_timestep))
+    terminated, reward, n_terminated = steps.next_timestep.terminated.ravel(), steps.next_timestep.reward.ravel(), 0
     for _, *batch in batches:
         batch = td3.Transitions(*batch)
         rows = [int(np.argmin(np.abs(observation[:, 0] - row).sum(axis=1))) for row in batch.observation]

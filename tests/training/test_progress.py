@@ -40,30 +40,28 @@ def test_line_per_evaluation(evaluation, line):
     assert not any("left" in other for other in between)  # that rate includes compiling
 
 
-def test_line_per_minute(monkeypatch):
-    """Also before the first evaluation, and during a long one."""
-    text, terminal_time = io.StringIO(), itertools.count(0, 40)
-    monkeypatch.setattr(time, "monotonic", lambda: float(next(terminal_time)))
+def record_lines(monkeypatch, seconds):
+    """Return a terminal and its text. The clock moves on by some seconds whenever it is read."""
+    text, clock = io.StringIO(), itertools.count(0, seconds)
+    monkeypatch.setattr(time, "monotonic", lambda: float(next(clock)))
     terminal = Terminal(Console(file=text))
-    terminal.on_start("Task method", 0, 20_000)  # the clock moves on by 40 s whenever it is read
-    for step in (100, 200, 300):
+    terminal.on_start("Task method", 0, 20_000)
+    return terminal, lambda: text.getvalue().splitlines()[1:]
+
+
+def test_line_per_minute_and_one_line_a_step(monkeypatch):
+    """Also before the first evaluation, and during a long one."""
+    terminal, lines = record_lines(monkeypatch, 40)
+    for step in (100, 200, 300, 400, 400, 400, 400):
         terminal.on_step(step)
-    for _ in range(4):
-        terminal.on_step(400)
-    assert [line.partition(",")[0] for line in text.getvalue().splitlines()[1:]] == [
+    assert [line.partition(",")[0] for line in lines()] == [
         "step   300 of 20000: 2.5 steps/s with compiling",
         "step   400 of 20000: evaluating",
     ]
-
-
-def test_one_line_a_step(monkeypatch):
-    """A minute has passed when an iteration ends, and its evaluation follows."""
-    text, terminal_time = io.StringIO(), itertools.count(0, 35)
-    monkeypatch.setattr(time, "monotonic", lambda: float(next(terminal_time)))
-    terminal = Terminal(Console(file=text))
-    terminal.on_start("Task method", 0, 20_000)
+    # A minute has passed when an iteration ends, and its evaluation follows.
+    terminal, lines = record_lines(monkeypatch, 35)
     for step in (2000, 4000):
         for _ in range(2):  # when the iteration ends, and during the evaluation
             terminal.on_step(step)
         terminal.on_evaluation(metrics(step, 50.0))
-    assert [line.split()[1] for line in text.getvalue().splitlines()[1:]] == ["2000", "4000"]
+    assert [line.split()[1] for line in lines()] == ["2000", "4000"]

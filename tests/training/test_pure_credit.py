@@ -5,6 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from jax.sharding import PartitionSpec
 
@@ -33,10 +34,6 @@ def make_steps(key, agents=()):
     return CreditSteps(observation, action, next_observation, episodic_reward, last, jnp.zeros_like(last)), true_reward
 
 
-def correlation(x, y):
-    return float(np.corrcoef(np.ravel(x), np.ravel(y))[0, 1])
-
-
 def train(credit, key, n_rounds=30, make=make_steps):
     """Observe and refit in a compiled loop. Return the state."""
 
@@ -45,14 +42,6 @@ def train(credit, key, n_rounds=30, make=make_steps):
 
     init_key, key = jax.random.split(key)
     return jax.lax.scan(body, credit.init(init_key), jax.random.split(key, n_rounds))[0]
-
-
-def test_rewards_are_recovered_from_returns():
-    credit = pure_credit("rrdu", **SUM, fit_updates=100)
-    steps, true_reward = make_steps(jax.random.key(1))
-    r_hat = jax.jit(lambda key: credit.reward(train(credit, key), steps))(jax.random.key(0))
-    assert r_hat.shape == (N_STEPS, N_ENVS)
-    assert correlation(r_hat, true_reward) > 0.9
 
 
 def test_phi_reads_actions_in_the_units_of_the_environment(reward):
@@ -66,19 +55,19 @@ def test_phi_reads_actions_in_the_units_of_the_environment(reward):
 
 
 def test_invalid_factors_are_counted_and_not_used(phi):
-    """A step is invalid where the observation is NaN. `lare-linear` reads factors alone. Phi is part of the program."""
-    credit = pure_credit("lare-linear", phi, **SUM)
+    """A step is invalid where the observation is NaN. `lare-rrdu` reads factors alone. Phi is part of the program."""
+    credit = pure_credit("lare-rrdu", phi, **SUM, fit_updates=2)
     # Step 9 is the last one of an episode.
     is_invalid = jnp.zeros((N_STEPS, N_ENVS), bool).at[[3, 9, 14], [0, 1, 2]].set(True)
 
     def steps_of(key):
         steps, true_reward = make_steps(key)
-        return steps._replace(
-            next_observation=jnp.where(is_invalid[..., None], jnp.nan, steps.next_observation)
-        ), true_reward
+        observation = jnp.where(is_invalid[..., None], jnp.nan, steps.next_observation)
+        return steps._replace(next_observation=observation), true_reward
 
     state = jax.jit(lambda key: train(credit, key, make=steps_of))(jax.random.key(0))
     assert int(state.n_invalid) == 90
+    assert int(optax.tree_utils.tree_get(state.learner.decoders[0].optimizer, "count")) == 30 * 2
     steps, _ = steps_of(jax.random.key(1))
     reward = jax.jit(credit.reward)
     r_hat = np.asarray(reward(state, steps))
@@ -88,23 +77,21 @@ def test_invalid_factors_are_counted_and_not_used(phi):
     expected = np.asarray(reward(state, valid))
     np.testing.assert_array_equal(r_hat[~is_invalid], expected[~is_invalid])
     assert np.isfinite(expected).all()
-    returns = float(state.learner.replay.episode_return.max())
-    assert returns != 0  # the reward of an invalid last step counts
+    assert float(state.learner.replay.episode_return.max()) != 0  # the reward of an invalid last step counts
 
 
 def test_functions_are_mapped_over_seeds():
     """`vmap` within `shard_map` gives what single calls give: the rewards of many agents behind the returns."""
     settings = default_credit(3).model_copy(update={"score": "sum"})
     credit = pure_credit("bayes", **SIZES, settings=settings, agents=3)
-    keys = jax.random.split(jax.random.key(0), 2)
-    steps, true_reward = make_steps(jax.random.key(1), (3,))
-    run = jax.jit(lambda key: credit.reward(train(credit, key, make=partial(make_steps, agents=(3,))), steps))
+    make, keys = partial(make_steps, agents=(3,)), jax.random.split(jax.random.key(0), 2)
+    steps, true_reward = make(jax.random.key(1))
+    run = jax.jit(lambda key: credit.reward(train(credit, key, make=make), steps))
     expected = jnp.stack([run(key) for key in keys])
-    assert correlation(expected[0], true_reward) > 0.9
-    mesh = jax.sharding.Mesh(jax.devices()[:1], ("seeds",))
-    sharded = jax.shard_map(
-        jax.vmap(run), mesh=mesh, in_specs=PartitionSpec("seeds"), out_specs=PartitionSpec("seeds"), check_vma=False
-    )
+    assert expected.shape == (2, N_STEPS, N_ENVS, 3)
+    assert np.corrcoef(expected[0].ravel(), true_reward.ravel())[0, 1] > 0.9
+    mesh, spec = jax.sharding.Mesh(jax.devices()[:1], ("seeds",)), PartitionSpec("seeds")
+    sharded = jax.shard_map(jax.vmap(run), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
     np.testing.assert_allclose(jax.jit(sharded)(keys), expected, rtol=1e-3, atol=1e-4)
 
 

@@ -64,8 +64,7 @@ def test_sequences_are_the_stored_episodes(method):
     batch = compute_sequences(learner, episodes, 12, config)
     assert np.asarray(episodes.mask).tolist() == [1] * 10 + [0, 0]
     timestep, next_timestep = steps.timestep, steps.next_timestep
-    for i in range(10, 12):
-        assert not any(values[i].any() for values in (batch.mask, batch.reward, batch.done))
+    assert not any(values[10:].any() for values in (batch.mask, batch.reward, batch.done))
     for i in range(10):
         env, first = int(episodes.first.env[i]), int(episodes.first.number[i])
         rows = next(rows for rows in episode_rows(steps, env) if rows[0] == first)
@@ -73,13 +72,11 @@ def test_sequences_are_the_stored_episodes(method):
         np.testing.assert_array_equal(batch.mask[i], np.arange(12) < length)
         np.testing.assert_array_equal(batch.done[i], np.arange(12) == length - 1)
         for name in ("observation", "state", "available"):
-            values = getattr(batch, name)[i]
+            values, final = getattr(batch, name)[i], getattr(next_timestep, name)[last, env]
             np.testing.assert_array_equal(values[:length], getattr(timestep, name)[rows, env])
-            if name == "available":
-                assert np.asarray(values[length:]).any(axis=-1).all()
-            else:
-                final = getattr(next_timestep, name)[last, env]
+            if name != "available":
                 np.testing.assert_array_equal(values[length:], np.broadcast_to(final, values[length:].shape))
+        assert np.asarray(batch.available[i, length:]).any(axis=-1).all()
         np.testing.assert_array_equal(batch.action[i, :length], steps.action[rows, env])
         index = replay.Index(np.full(12, env), np.concatenate([rows, np.full(12 - length, last)]))
         reward = np.asarray(jitted(rewards, config)(read(learner.replay, index), learner.decoders))[:length]
@@ -122,9 +119,9 @@ def test_targets_are_copied_after_enough_episodes():
     assert is_copied == [False, True, False, True]
 
 
-def train_step(config, learner, steps, key=0):
-    train = jax.jit(partial(sequences.train_step, config=config))
-    return train(add_seed_axis(learner), add_seed_axis(steps), jax.random.key(key)[None], jnp.array(0))
+def train_step(config, learner, steps, train=None):
+    train = train or jitted(sequences.train_step, config)
+    return train(add_seed_axis(learner), add_seed_axis(steps), jax.random.key(0)[None], jnp.array(0))
 
 
 @pytest.mark.parametrize("method", [long_case("dense"), long_case("lare-rd"), "lare-rrdu"])
@@ -161,7 +158,7 @@ def test_batch_lengths_change_nothing(monkeypatch):
     results = [train_step(config, learner, steps)]
     monkeypatch.setattr(sequences, "MIN_STEPS_TO_SHORTEN", 0)
     assert sequences._batch_lengths(config) == [3, 6, 12]
-    results.append(train_step(config, learner, steps))
+    results.append(train_step(config, learner, steps, jax.jit(partial(sequences.train_step, config=config))))
     assert float(results[1][1]["algorithm/updates"][0]) == 5
     assert_close(*results, 1e-3)
 

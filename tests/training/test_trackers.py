@@ -47,10 +47,8 @@ def test_wandb_gets_every_number(dense_run, tmp_path, monkeypatch):
 
     def init_and_record(**arguments):
         run = init(**arguments)
-        log = run.log
-        monkeypatch.setattr(
-            run, "log", lambda line, step: logged.append((arguments["name"], step, line)) or log(line, step=step)
-        )
+        record, log = (lambda line, step: logged.append((arguments["name"], step, line))), run.log
+        monkeypatch.setattr(run, "log", lambda line, step: record(line, step) or log(line, step=step))
         return run
 
     listener.init = init_and_record
@@ -59,13 +57,10 @@ def test_wandb_gets_every_number(dense_run, tmp_path, monkeypatch):
     assert len(list(tmp_path.glob("wandb/offline-run-*/*.wandb"))) == 2
 
 
-@pytest.mark.parametrize(("listener", "library"), [(WeightsAndBiases, "wandb"), (MLflow, "mlflow")])
-def test_missing_library(listener, library, monkeypatch):
-    monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(LareError, match=rf"needs an extra: .*\[{library}\]"):
-        listener()
-
-
-def test_unusable_tracking_server():
+def test_missing_library_and_unusable_server(monkeypatch):
     with pytest.raises(LareError, match=r"MLflow cannot be used: .*nowhere"):
         MLflow(tracking_uri="nowhere://")
+    for listener, library in ((WeightsAndBiases, "wandb"), (MLflow, "mlflow")):
+        monkeypatch.setitem(sys.modules, library, None)
+        with pytest.raises(LareError, match=rf"needs an extra: .*\[{library}\]"):
+            listener()

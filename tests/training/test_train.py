@@ -11,10 +11,8 @@ import pytest
 
 import lare_rl
 from helpers.listeners import metrics_without_times
-from helpers.long_tests import long_case
 from helpers.toy_envs import PHI, pick_spec, toy_spec
 from helpers.training_runs import CHASE, copy_run, resume_quietly, train_and_stop, train_quietly
-from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.config.migrate import FORMAT
 from lare_rl.config.resolve import resolve
@@ -35,10 +33,6 @@ from lare_rl.training.unroll_host import DivergedError
 from lare_rl.util.provenance import code_version
 
 
-def phi_for(method, phi):
-    return phi if METHODS[method].needs_phi else None
-
-
 def test_config_names_everything_a_run_depends_on(factor_run, phi, tmp_path):
     run = copy_run(factor_run, tmp_path / "run")
     assert run.function.source == phi.source
@@ -53,12 +47,16 @@ def test_config_names_everything_a_run_depends_on(factor_run, phi, tmp_path):
         open_run(run.directory)
 
 
-@pytest.mark.parametrize("candidates", [1, 5])
-def test_candidates_setting_chooses_recording(candidates):
+def test_candidates_setting_chooses_recording():
     task = lare_rl.load_task("Reacher-v4")
-    settings = resolve(lare_rl.Settings(method="lare-rd", candidates=candidates), task)
-    (function,) = choose_functions(task, settings, None)
-    assert function.source == lare_rl.design(task, candidates=candidates).source
+    for candidates in (1, 5):
+        settings = resolve(lare_rl.Settings(method="lare-rd", candidates=candidates), task)
+        (function,) = choose_functions(task, settings, None)
+        assert function.source == lare_rl.design(task, candidates=candidates).source
+
+
+MANY_FACTORS = f"def evaluation_func(o, a):\n    return [{', '.join(f'o[:, 0:1] * {i + 1}' for i in range(17))}]\n"
+SHORT = {"method": "dense", "rollout_steps": 1, "evaluate_every": 1}
 
 
 @pytest.mark.parametrize(
@@ -68,19 +66,11 @@ def test_candidates_setting_chooses_recording(candidates):
         ({"candidates": 1}, PHI, "draw and candidates"),
         ({"method": "rrdu"}, PHI, "rrdu needs no latent function"),
         ({"method": "llm-reward"}, PHI, "this one has 2"),
-        (
-            {"method": "lare-signs"},
-            f"def evaluation_func(o, a):\n    return [{', '.join(f'o[:, 0:1] * {i + 1}' for i in range(17))}]\n",
-            "at most 16 factors, and there are 17",
-        ),
+        ({"method": "lare-signs"}, MANY_FACTORS, "at most 16 factors, and there are 17"),
         ({"method": "dense", "capacity": 43}, None, "capacity = 43.*an iteration of Chase takes up to 44"),
         ({"method": "rrdu", "algorithm": "ppo", "capacity": 43}, None, "capacity = 43.*a rollout of Chase"),
-        ({"method": "dense", "steps": 9, "rollout_steps": 1, "evaluate_every": 1}, None, "steps = 9 are too few"),
-        (
-            {"method": "dense", "steps": 18, "rollout_steps": 1, "evaluate_every": 2, "environments": 2},
-            None,
-            "environments = 2 needs at least 20",
-        ),
+        (SHORT | {"steps": 9}, None, "steps = 9 are too few"),
+        (SHORT | {"steps": 18, "evaluate_every": 2, "environments": 2}, None, "environments = 2 needs at least 20"),
     ],
 )
 def test_bad_arguments_leave_no_directory(changes, function, message, small, tmp_path):
@@ -100,14 +90,11 @@ def test_existing_directory_is_refused(out, dense, tmp_path, monkeypatch):
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["precious"]
 
 
-def test_messages_of_dense_run(dense_training):
-    _, messages = dense_training
+def test_messages_and_metrics(dense, dense_training, echo_run, tmp_path):
+    dense_run, messages = dense_training
     assert re.match(r"fit_updates .* dense .*\(and \d+ more\)", messages[0])
     assert "first 36 steps are random" in messages[1]
     assert not any(message.startswith("Observations are large") for message in messages)
-
-
-def test_metrics(dense, dense_run, echo_run, tmp_path):
     assert all(line["evaluation/distance"] > 0 and ACTOR_SATURATION in line for line in dense_run.metrics())
     # An update for each step after the warmup.
     assert load_learner(dense_run).learner.algorithm.critic_optimizer[0].count.tolist() == [240 - 36] * 2
@@ -194,14 +181,15 @@ def test_close_reports_a_failed_checkpoint_after_an_error_of_the_environments(mo
         threads.submit(print)
 
 
-@pytest.mark.parametrize("error", [MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")])
-def test_full_memory_is_reported(error, small, tmp_path, monkeypatch):
-    def fail(run):
-        raise error
+def test_full_memory_is_reported(small, tmp_path, monkeypatch):
+    for i, error in enumerate([MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")]):
 
-    monkeypatch.setattr(training, "start_session", fail)
-    with pytest.raises(LareError, match="memory is full: 2 seeds with a replay of 482 rows each"):
-        train_quietly(toy_spec(), small(method="dense"), tmp_path / "run")
+        def fail(run, error=error):
+            raise error
+
+        monkeypatch.setattr(training, "start_session", fail)
+        with pytest.raises(LareError, match="memory is full: 2 seeds with a replay of 482 rows each"):
+            train_quietly(toy_spec(), small(method="dense"), tmp_path / f"run-{i}")
 
 
 # Toys that must be learned.
@@ -212,54 +200,39 @@ def test_td3_learns_toy(learned_training):
     assert learned_training[0].metrics()[-1]["evaluation/return"] > -3
 
 
+OFF_POLICY = {"hidden": (32,), "learning_rate": 3e-3, "batch_size": 64, "gamma": 0.5, "warmup": 400}
+PPO = {"hidden": (32,), "learning_rate": 3e-3, "gamma": 0.5, "minibatch_size": 50}
+DEEP = PPO | {"hidden": (32, 32)}
+PICK_PHI = "def evaluation_func(o, a):\n    return [(o * a) @ np.ones((4, 1))]\n"
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("algorithm", "method"),
+    ("task", "algorithm", "method", "steps", "hyperparameters", "least"),
     [
-        *(long_case("td3", method) for method in ("dense", "lare-rrdu", "rd", "bayes")),
-        ("ddpg", "lare-linear"),
-        ("sac", "dense"),
+        *((toy_spec(), "td3", method, 2000, OFF_POLICY, -3) for method in ("dense", "lare-rrdu", "rd", "bayes")),
+        (toy_spec(), "ddpg", "lare-linear", 1200, OFF_POLICY, -3),
+        (toy_spec(), "sac", "dense", 1200, OFF_POLICY, -3),
+        (toy_spec(), "ppo", "dense", 8000, DEEP, -3),
+        (toy_spec(), "ppo", "lare-bayes", 8000, DEEP, -3),
+        (pick_spec(), "ppo", "dense", 4000, PPO, 17),
+        (pick_spec(), "ppo", "lare-rd", 4000, PPO, 17),
     ],
 )
-def test_off_policy_learns_toy(algorithm, method, phi, tmp_path):
-    small = {"hidden": (32,), "learning_rate": 3e-3, "batch_size": 64, "gamma": 0.5, "warmup": 400}
+def test_toy_is_learned(task, algorithm, method, steps, hyperparameters, least, tmp_path):
+    """Of the discrete toy, a random policy gets 5 of 20, and the best policy 20."""
+    values = {"steps": steps, "evaluate_every": steps, "rollout_steps": 200, "fit_updates": 50}
+    if algorithm != "ppo":
+        values = {"steps": steps, "evaluate_every": 400, "rollout_steps": 20}
     settings = lare_rl.Settings(
         algorithm=algorithm,
         method=method,
-        steps=2000 if algorithm == "td3" else 1200,
-        rollout_steps=20,
-        evaluate_every=400,
-        **{algorithm: ALGORITHMS[algorithm].settings.model_copy(update=small)},
+        **{algorithm: ALGORITHMS[algorithm].settings.model_copy(update=hyperparameters)},
         **({"capacity": 380} if algorithm == "ddpg" else {}),  # with fewer than 20 episodes, no explanation is compiled
+        **values,
         credit=CreditSettings(hidden=(32,), learning_rate=3e-3, sampled_steps=8, steps=64, score="sum"),
     )
-    run = train_quietly(toy_spec(), settings, tmp_path / "run", phi_for(method, phi))
-    assert run.metrics()[-1]["evaluation/return"] > -3
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("task", "method", "steps", "hidden", "least"),
-    [
-        (toy_spec(), "dense", 8000, (32, 32), -3),
-        long_case(toy_spec(), "lare-bayes", 8000, (32, 32), -3),
-        (pick_spec(), "dense", 4000, (32,), 17),
-        (pick_spec(), "lare-rd", 4000, (32,), 17),
-    ],
-)
-def test_ppo_learns_toy(task, method, steps, hidden, least, phi, tmp_path):
-    """Of the discrete toy, a random policy gets 5 of 20, and the best policy 20."""
-    if task == pick_spec():
-        phi = verify_function("def evaluation_func(o, a):\n    return [(o * a) @ np.ones((4, 1))]\n", task)
-    settings = lare_rl.Settings(
-        algorithm="ppo",
-        method=method,
-        steps=steps,
-        evaluate_every=steps,
-        ppo=PPOSettings(hidden=hidden, learning_rate=3e-3, gamma=0.5, minibatch_size=50),
-        rollout_steps=200,
-        fit_updates=50,
-        credit=CreditSettings(hidden=hidden, learning_rate=3e-3, sampled_steps=8, steps=64),
-    )
-    run = train_quietly(task, settings, tmp_path / "run", phi_for(method, phi))
+    source = PICK_PHI if task == pick_spec() else PHI
+    function = verify_function(source, task) if METHODS[method].needs_phi else None
+    run = train_quietly(task, settings, tmp_path / "run", function)
     assert run.metrics()[-1]["evaluation/return"] > least
