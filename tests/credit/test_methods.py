@@ -58,9 +58,9 @@ def registered(monkeypatch):
         monkeypatch.setattr(registry, "_values", dict(registry._values))
 
 
-def register(fit, init=lambda key, spec: Squares(spec.output_scale * jnp.ones(spec.n_inputs))):
-    register_decoder(Decoder("mine", init))
-    register_method(Method("mine", "mine", "this test", inputs=methods.RAW, fit=fit, decoder="mine"))
+def register(fit, init=lambda key, spec: Squares(spec.output_scale * jnp.ones(spec.n_inputs)), name="mine"):
+    register_decoder(Decoder(name, init))
+    register_method(Method(name, name, "this test", inputs=methods.RAW, fit=fit, decoder=name))
 
 
 @pytest.mark.parametrize("fit", [Fit.ALL_STEPS, Fit.DECODER_LOSS, long_case(Fit.SAMPLED_STEPS_UNBIASED)])
@@ -81,9 +81,9 @@ def test_decoders_that_are_refused(registered):
     register(Fit.DECODER_LOSS)
     with pytest.raises(LareError, match="mine assigns credit to a single agent, and the task has 2 agents"):
         CreditAssigner("mine", observation_space=2, action_space=1, agents=2, max_steps=5)
-    register(Fit.ALL_STEPS, lambda key, spec: eqx.nn.MLP(spec.n_inputs, 1, 4, 1, key=key))
-    with pytest.raises(LareError, match=r"'mine' holds .* instead of eqx.nn.MLP.*, use lare_rl.nn.networks.MLP"):
-        CreditAssigner("mine", observation_space=2, action_space=1)
+    register(Fit.ALL_STEPS, lambda key, spec: eqx.nn.MLP(spec.n_inputs, 1, 4, 1, key=key), "functions")
+    with pytest.raises(LareError, match=r"'functions' holds .* instead of eqx.nn.MLP.*, use lare_rl.nn.networks.MLP"):
+        CreditAssigner("functions", observation_space=2, action_space=1)
 
 
 @pytest.mark.parametrize("agents", [1, 2])

@@ -65,7 +65,7 @@ def test_draws_and_kinds():
     with pytest.raises(LareError, match=r"'Chase'.*model=.*--model NAME.*--function phi\.py.*bayes") as error:
         design(toy_spec())
     assert "\n" not in str(error.value)
-    for candidates, words in ((3, "have 1 or 5 candidates"), (0, "= 0"), (101, "= 101")):
+    for candidates, words in ((3, "1 or 5 candidates"), (0, "= 0"), (101, "= 101")):
         with pytest.raises(LareError, match=words):
             design(task, candidates=candidates)
     model = scripted(GOOD)
