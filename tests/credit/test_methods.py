@@ -76,11 +76,14 @@ def test_registered_method_is_trained(fit, registered):
     assert np.isfinite(credit.metrics()["credit/loss"])
 
 
-def test_decoders_that_are_refused(registered):
+def test_loss_of_a_decoder_is_for_a_single_agent(registered):
     """Steps of several agents would be mixed with each other: `loss` has an axis of steps, and none of agents."""
     register(Fit.DECODER_LOSS)
     with pytest.raises(LareError, match="mine assigns credit to a single agent, and the task has 2 agents"):
         CreditAssigner("mine", observation_space=2, action_space=1, agents=2, max_steps=5)
+
+
+def test_decoder_with_functions_is_refused_in_one_line(registered):
     register(Fit.ALL_STEPS, lambda key, spec: eqx.nn.MLP(spec.n_inputs, 1, 4, 1, key=key))
     with pytest.raises(LareError, match=r"'mine' holds .* instead of eqx.nn.MLP.*, use lare_rl.nn.networks.MLP"):
         CreditAssigner("mine", observation_space=2, action_space=1)
