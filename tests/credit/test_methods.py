@@ -58,9 +58,9 @@ def registered(monkeypatch):
         monkeypatch.setattr(registry, "_values", dict(registry._values))
 
 
-def register(fit, init=lambda key, spec: Squares(spec.output_scale * jnp.ones(spec.n_inputs)), name="mine"):
-    register_decoder(Decoder(name, init))
-    register_method(Method(name, name, "this test", inputs=methods.RAW, fit=fit, decoder=name))
+def register(fit, init=lambda key, spec: Squares(spec.output_scale * jnp.ones(spec.n_inputs))):
+    register_decoder(Decoder("mine", init))
+    register_method(Method("mine", "mine", "this test", inputs=methods.RAW, fit=fit, decoder="mine"))
 
 
 @pytest.mark.parametrize("fit", [Fit.ALL_STEPS, Fit.DECODER_LOSS, long_case(Fit.SAMPLED_STEPS_UNBIASED)])
@@ -76,14 +76,17 @@ def test_registered_method_is_trained(fit, registered):
     assert np.isfinite(credit.metrics()["credit/loss"])
 
 
-def test_decoders_that_are_refused(registered):
+def test_loss_of_a_decoder_is_for_a_single_agent(registered):
     """Steps of several agents would be mixed with each other: `loss` has an axis of steps, and none of agents."""
     register(Fit.DECODER_LOSS)
     with pytest.raises(LareError, match="mine assigns credit to a single agent, and the task has 2 agents"):
         CreditAssigner("mine", observation_space=2, action_space=1, agents=2, max_steps=5)
-    register(Fit.ALL_STEPS, lambda key, spec: eqx.nn.MLP(spec.n_inputs, 1, 4, 1, key=key), "functions")
-    with pytest.raises(LareError, match=r"'functions' holds .* instead of eqx.nn.MLP.*, use lare_rl.nn.networks.MLP"):
-        CreditAssigner("functions", observation_space=2, action_space=1)
+
+
+def test_decoder_with_functions_is_refused_in_one_line(registered):
+    register(Fit.ALL_STEPS, lambda key, spec: eqx.nn.MLP(spec.n_inputs, 1, 4, 1, key=key))
+    with pytest.raises(LareError, match=r"'mine' holds .* instead of eqx.nn.MLP.*, use lare_rl.nn.networks.MLP"):
+        CreditAssigner("mine", observation_space=2, action_space=1)
 
 
 @pytest.mark.parametrize("agents", [1, 2])
