@@ -194,8 +194,8 @@ def jobs_of_contender(contender: Contender, budget: Budget, name: str, root: Pat
     }
     shared_settings |= budget.algorithms.get(choose_algorithm(contender.algorithm, load_env_spec(task)), {})
     latent = METHODS.find(contender.method).needs_phi
+    settings = {**contender.settings, **budget.settings, **shared_settings}
+    settings["credit"] = {"start_value": False, **settings.get("credit", {})}  # as published
     for draw in range(min(budget.draws, contender.draws) if latent else 1):
-        job = make_job(
-            root, task, Settings(**{**contender.settings, **budget.settings, **shared_settings, "draw": draw})
-        )
+        job = make_job(root, task, Settings(**settings, draw=draw))
         yield replace(job, directory=job.directory.with_name(job.directory.name + contender.ending))

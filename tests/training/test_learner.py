@@ -76,10 +76,10 @@ def test_rewards(method, scale_rewards):
 
 
 def check_closed_form(credit, z, reward):
-    """Check the sums over episodes, weighted by their steps, of standardised factors, R/T and R. NaN: no agent was alive."""
+    """Check the sums over episodes, weighted by their steps, of standardised factors, 1/T, R/T and R. NaN: no agent was alive."""
     decoder = credit.closed_form.decoder
     standard = [np.nan_to_num((rows - np.asarray(decoder.mean)) / np.asarray(decoder.std)) for rows in z]
-    v = [[*rows.mean(axis=0), r.mean(), r.sum()] for rows, r in zip(standard, reward, strict=True)]
+    v = [[*rows.mean(axis=0), 1 / len(r), r.mean(), r.sum()] for rows, r in zip(standard, reward, strict=True)]
     length = np.array([len(rows) for rows in z])
     centred = np.array(v) - np.average(v, axis=0, weights=length)
     with jax.enable_x64(True):

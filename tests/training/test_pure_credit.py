@@ -34,6 +34,10 @@ def make_steps(key, agents=()):
     return CreditSteps(observation, action, next_observation, episodic_reward, last, jnp.zeros_like(last)), true_reward
 
 
+def correlation(x, y):
+    return float(np.corrcoef(np.ravel(x), np.ravel(y))[0, 1])
+
+
 def train(credit, key, n_rounds=30, make=make_steps):
     """Observe and refit in a compiled loop. Return the state."""
 
@@ -42,6 +46,14 @@ def train(credit, key, n_rounds=30, make=make_steps):
 
     init_key, key = jax.random.split(key)
     return jax.lax.scan(body, credit.init(init_key), jax.random.split(key, n_rounds))[0]
+
+
+def test_rewards_are_recovered_from_returns():
+    credit = pure_credit("rrdu", **SUM, fit_updates=100)
+    steps, true_reward = make_steps(jax.random.key(1))
+    r_hat = jax.jit(lambda key: credit.reward(train(credit, key), steps))(jax.random.key(0))
+    assert r_hat.shape == (N_STEPS, N_ENVS)
+    assert correlation(r_hat, true_reward) > 0.9
 
 
 def test_phi_reads_actions_in_the_units_of_the_environment(reward):

@@ -115,9 +115,15 @@ def _normalise(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Reso
     score, method = resolved.credit.score, METHODS.find(resolved.method)
     if score == "auto":
         score = find_score_type(task) or score
-    if score != "binary" and env.fixed_length and task.payment_rule.is_regular(env.max_steps):
+    is_fixed = env.fixed_length and task.payment_rule.is_regular(env.max_steps)
+    if score != "binary" and is_fixed:
         score = "auto"  # sum and mean have the same decoder
-    credit = {"score": score, "exact": method.choose_exact(resolved.credit.exact)}
+    may_start = "start_value" in method.settings and score != "average" and not is_fixed
+    credit = {
+        "score": score,
+        "start_value": resolved.credit.start_value and may_start,
+        "exact": method.choose_exact(resolved.credit.exact),
+    }
     changes["credit"] = resolved.credit.model_copy(update=credit)
     return resolved.model_copy(update=changes)
 
