@@ -123,6 +123,9 @@ COMPARISONS = {
     "wheat, SAC": simulator("Wheat", "sac", 6_000),
     "traffic, PPO": simulator("Traffic", "ppo", 36_000, ["episodic"]),
     "job shop, PPO": simulator("JobShop", "ppo", 100_000, ["episodic", "dense"]),
+    "power grid, PPO": Comparison(
+        30_720, simulator_runs("Grid", "ppo", "episodic"), default=simulator_runs("Grid", "ppo", "lare-bayes")
+    ),
     f"{HALF_CHEETAH}, TD3, short": Comparison(
         30_000,
         [f"{TEN_SEEDS}/episodic"],
