@@ -225,7 +225,7 @@ def best_raw(comparison: Comparison) -> str:
 
 def method_runs(comparison: Comparison) -> dict[str, Directories]:
     return {
-        RAW: comparison.raw[best_raw(comparison)],
+        RAW: comparison.raw[best_raw(comparison)] if comparison.raw else (),
         PAPER: comparison.paper,
         DEFAULT: comparison.default,
     }
@@ -343,7 +343,8 @@ def main() -> None:
     for name, comparison in COMPARISONS.items():
         cells = [f"{name}, {comparison.steps:,}"]
         runs = method_runs(comparison)
-        cells += [cell(comparison.episodic, comparison), f"{cell(runs[RAW], comparison)}, `{best_raw(comparison)}`"]
+        raw = f"{cell(runs[RAW], comparison)}, `{best_raw(comparison)}`" if runs[RAW] else "-"
+        cells += [cell(comparison.episodic, comparison), raw]
         columns = comparison.without_phi, runs[PAPER], runs[DEFAULT], comparison.dense
         cells += [cell(directories, comparison) for directories in columns]
         print(f"| {' | '.join(cells)} |")
