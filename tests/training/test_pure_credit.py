@@ -48,6 +48,7 @@ def train(credit, key, n_rounds=30, make=make_steps):
     return jax.lax.scan(body, credit.init(init_key), jax.random.split(key, n_rounds))[0]
 
 
+@pytest.mark.long
 def test_rewards_are_recovered_from_returns():
     credit = pure_credit("rrdu", **SUM, fit_updates=100)
     steps, true_reward = make_steps(jax.random.key(1))
