@@ -72,7 +72,7 @@ def test_must_learn_contributions_and_actions():
     rows, reward = np.concatenate([observation, np.eye(2)[chosen]], axis=-1).astype(np.float32), observation[..., 0]
     spec = observation_spec(2, METHODS["tar2"], CreditSettings(learning_rate=1e-3), steps, agents)
     spec = replace(spec, method=METHODS["tar2"], action_size=2)
-    batches, flat = whole_batches(rows, reward.mean(axis=(2, 3, 4)), steps), rows[0].reshape(-1, agents, 4)
+    batches, flat = whole_batches(rows, reward.mean(axis=(2, 3)), steps), rows[0].reshape(-1, agents, 4)
     state = observed_state(spec, flat, batches.mean_reward[0], batches.length[0], KEY)
     state, _ = fit_batches(state, batches, spec)
     contributions = decoder_rewards(state, flat, spec).reshape(n_episodes, steps, agents)

@@ -76,15 +76,14 @@ def test_bad_cross_play(runs, make_run):
     chase = make_run("a", [1.0])
     with pytest.raises(LareError, match="episodes = 0"):
         cross_play((runs[0], runs[1]), episodes=0)
-    for pair, message in {
-        (chase, chase): "two teams that learn, and Chase has 1$",
-        (chase, runs[0]): "these are of Chase and CompetitivePP-6$",
-        (runs[0], change_run(runs[0], settings={"algorithm": "other"})): "algorithm, and these are of ippo and other$",
-        (
-            runs[0],
-            change_run(runs[0], task={"description": "Other."}),
-        ): "different tasks named CompetitivePP-6$",
-    }.items():
+    other_algorithm = change_run(runs[0], settings={"algorithm": "other"})
+    other_task = change_run(runs[0], task={"description": "Other."})
+    for pair, message in [
+        ((chase, chase), "two teams that learn, and Chase has 1$"),
+        ((chase, runs[0]), "these are of Chase and CompetitivePP-6$"),
+        ((runs[0], other_algorithm), "algorithm, and these are of ippo and other$"),
+        ((runs[0], other_task), "different tasks named CompetitivePP-6$"),
+    ]:
         with pytest.raises(LareError, match=message):
             cross_play(pair)
 
