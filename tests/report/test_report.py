@@ -234,7 +234,7 @@ def test_unknown_step_rewards(pages):
 
 
 def test_settings_of_a_run(make_run, tmp_path):
-    """Those that differ from the defaults are listed. Without its environment, the report has what its files tell."""
+    """The report lists settings that differ from the defaults. Without the environment, it reads the run's files alone."""
     run = make_run("a", [1.0], method="bayes")
     page = page_of(run, tmp_path)
     differing = page[page.index("differ from the defaults") :].partition("</table>")[0]

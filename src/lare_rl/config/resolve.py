@@ -118,13 +118,9 @@ def _normalise(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Reso
     is_fixed = env.fixed_length and task.payment_rule.is_regular(env.max_steps)
     if score != "binary" and is_fixed:
         score = "auto"  # sum and mean have the same decoder
-    may_start = "start_value" in method.settings and score != "average" and not is_fixed
-    credit = {
-        "score": score,
-        "start_value": resolved.credit.start_value and may_start,
-        "exact": method.choose_exact(resolved.credit.exact),
-    }
-    changes["credit"] = resolved.credit.model_copy(update=credit)
+    credit = resolved.credit.model_copy(update={"score": score, "exact": method.choose_exact(resolved.credit.exact)})
+    has_start_value = method.has_start_value(credit, fixed_length=is_fixed)
+    changes["credit"] = credit.model_copy(update={"start_value": has_start_value})
     return resolved.model_copy(update=changes)
 
 

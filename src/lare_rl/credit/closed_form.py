@@ -15,8 +15,8 @@ whose prior precision is set by the evidence, like that of a group of features:
 
 The intercept takes part in the prediction of a return, but no step is paid for it: an easy level does not credit what happens on it.
 
-If episodes differ in length, a sum may have a start value c, such as the 100% of which a score takes a part off. It is the weight of
-1/T, has a strength of its own like a group of features, and no step is paid for it:
+If episodes differ in length, a sum may have a start value c. An example is a score of 100% minus all losses: c is 100%. No step is
+paid for c. In a fit of R/T, it is the weight of 1/T, and the evidence sets its prior precision:
 
     R_k = c + sum_t (b + w . f_kt) + noise,     R_k / T_k = b + w . m_k + c / T_k + noise,     c ~ N(0, 1 / alpha_start)
 

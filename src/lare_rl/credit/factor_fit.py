@@ -101,8 +101,7 @@ def assess_factors(
             score_type = ScoreType(int(is_average))
         length_r2 = None
         if score_type is ScoreType.SUM and lengths_differ:
-            no_levels = np.zeros_like(one_hot)
-            lengths_alone = np.hstack([np.zeros_like(features), 1 / length[:, None], no_levels])
+            lengths_alone = np.hstack([np.zeros_like(features), 1 / length[:, None], np.zeros_like(one_hot)])
             length_r2 = r_squared(returns[N_FIRST:], predict(lengths_alone, score_type=ScoreType.SUM)[0])[0]
         level_r2 = None
         if level is not None:

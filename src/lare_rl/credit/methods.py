@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
+from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoders import DECODERS, Decoder
 from lare_rl.credit.input_names import InputNames
 from lare_rl.errors import LareError, short_repr
@@ -171,6 +172,11 @@ class Method:
         if exact != "auto":
             return exact
         return "last" if self.fit is Fit.PREFIX_EVIDENCE else "no"
+
+    def has_start_value(self, settings: CreditSettings, *, fixed_length: bool) -> bool:
+        """Return whether a sum may have a start value. `fixed_length` is whether all episodes have the same length."""
+        is_read = "start_value" in self.settings and settings.score != "average" and not fixed_length
+        return is_read and settings.start_value
 
     @property
     def multi_agent_only(self) -> bool:

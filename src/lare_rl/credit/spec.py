@@ -86,13 +86,8 @@ class CreditSpec:
             n_tracked=sizes.get("history", 0) // 3,
             n_levels=0 if self.method.fit is Fit.SIGNS else self.n_levels,
             prefixes=self.method.fit is Fit.PREFIX_EVIDENCE,
-            start_value=self._may_have_start_value,
+            start_value=self.method.has_start_value(self.settings, fixed_length=self.fixed_length),
         )
-
-    @property
-    def _may_have_start_value(self) -> bool:
-        settings, names = self.settings, self.method.settings
-        return not self.fixed_length and "start_value" in names and settings.start_value and settings.score != "average"
 
     @cached_property
     def score_types(self) -> tuple[ScoreType, ...]:
@@ -131,8 +126,8 @@ class CreditSpec:
         """The factor sqrt(nT) of a decoder's output for n agents, or 1 for a single agent. T is the longest episode.
 
         R/T is the mean of nT rewards, and a rare reward of a few agents is larger than this mean by about that factor. An update of Adam
-        changes the output by about as much whatever unit the targets have, and the decoder of many agents has few updates. Without
-        this factor, its output would reach the size of a rare reward only after dozens of updates of the policy.
+        changes the output by about the same amount, whatever the unit of the targets is. The decoder of many agents has few updates.
+        Without this factor, its output would reach the size of a rare reward only after dozens of updates of the policy.
         """
         return 1.0 if self.agents == 1 else math.sqrt(self.max_steps * self.agents)
 

@@ -7,7 +7,7 @@
 
 The graph has only the inputs that the method uses, and phi is a part of it: its rows are agents. If credit is assigned by the global state,
 `before` and `after` are states, `action` holds the actions of all agents side by side, and there is one r_hat for the team.
-The r_hat of `llm-reward` is what its function returns, in any unit.
+For `llm-reward`, r_hat is the number that the function returns, in a unit of its own.
 """
 
 from functools import partial
