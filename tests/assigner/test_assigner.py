@@ -84,9 +84,10 @@ def test_rewards_of_every_method(method, function):
         with pytest.raises(LareError, match="rewards_at"):
             credit.rewards(*episodes[0][:3])
     else:
+        n_compared = 7 if credit.config.spec.is_exact else 8  # the residual at the last step needs the return
         for episode, expected in zip(episodes, r_hat, strict=True):
             r_hat_again = credit.rewards(*episode[:3], begins=np.arange(8) == 0)
-            np.testing.assert_allclose(r_hat_again, expected, rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(r_hat_again[:n_compared], expected[:n_compared], rtol=1e-5, atol=1e-6)
     metrics = credit.metrics()
     assert (metrics["credit/episodes"], metrics["credit/dropped"]) == (12, 0)
     assert (metrics["credit/fits"] > 0) == np.isfinite(metrics["credit/loss"]) == METHODS[method].uses_gradient

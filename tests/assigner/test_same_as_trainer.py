@@ -31,7 +31,7 @@ PHI_ENV = replace(ONE_AGENT, observation_size=2, action_size=1, low=ONE_AGENT.lo
 def learn(method, env, phi=None, payments=PAID_AT_END, exact="no", group=None, score="sum", n_running=2):
     """Return a learner and an assigner that have learned from the same steps. The last episode has `n_running` steps so far."""
     scored_observation = "after" if phi is None else toy_spec().scored_observation
-    algorithm = "td3" if env.n_agents == 1 else "ippo"
+    algorithm = "td3" if env.n_agents == 1 else "qmix"
     config = small_config(
         method, algorithm, env, capacity=1000, scored_observation=scored_observation, payments=payments
     )

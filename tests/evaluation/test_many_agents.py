@@ -64,7 +64,7 @@ def test_cross_play(runs, command):
     status, out, err = command("cross-play", *(run.directory for run in runs), "--episodes", N_EPISODES)
     assert (status, err) == (0, "")
     assert out.count(" ± ") == 5  # four matches, and the line that explains the numbers
-    assert out.startswith("predator of, against prey of")
+    assert out.startswith("predator (rows) against prey")
 
 
 def change_run(run, **changes):
@@ -95,7 +95,7 @@ def test_evaluate_command(runs, command, tmp_path):
     names += [
         f"CompetitivePP-6-{team}, {line}" for team in ("predator", "prey") for line in ("random actions", "difference")
     ]
-    assert [line.split(": ")[0] for line in out.splitlines()[1:-1]] == names
+    assert set(names) <= {line.split(": ")[0] for line in out.splitlines()}
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF8")
 
 

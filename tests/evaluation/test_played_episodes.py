@@ -15,6 +15,8 @@ from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.train import start_session
 
+pytestmark = pytest.mark.long
+
 TASK = echo_spec(environment="hosted/three", credit_scope="state", observation_size=9, action_size=9, payments=2)
 N_EPISODES = 12
 

@@ -124,10 +124,10 @@ def test_better_function_is_kept(episodes):
 
 @pytest.mark.long
 def test_episodes_of_policy():
-    model = ScriptedModel(RIGHT, WRONG)
+    model = ScriptedModel(WRONG, RIGHT)
     design_and_reflect(model, 1, policy=lambda observation: observation[:1] + 0.5)
     episodes = play_episodes(TASK, N_EPISODES, lambda observation: observation[:1] + 0.5)
-    assert assess(RIGHT, episodes).ranges[0] in model.requests[1][-1]["content"]
+    assert assess(WRONG, episodes).ranges[0] in model.requests[1][-1]["content"]
 
 
 @pytest.mark.long

@@ -62,6 +62,7 @@ def read_numbers(line):
     return [math.nan if value is None else value for value in line.values()]
 
 
+@pytest.mark.long
 def test_devices_train_as_a_single_device(echo_run, echo_settings, tmp_path):
     check_devices(echo_run, echo_settings, tmp_path, 2)
 
