@@ -1,4 +1,4 @@
-"""Many copies of a `HostEnv`, stepped in lockstep. `LocalVecEnv` has them in this process, `workers.SubprocVecEnv` in others."""
+"""Several `HostEnv`s, stepped in lockstep: in this process (`LocalVecEnv`) or in others (`workers.SubprocVecEnv`)."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -30,26 +30,25 @@ Maker = Callable[[], HostEnv]
 class VecEnv(ABC):
     """n environments with the same sizes. In training, n is the number of seeds times the environments of a seed, seeds first.
 
-    `where` selects environments: the rows of the others do not change. The next call overwrites the returned arrays. Environments whose
-    episode has ended are not reset: the caller does it.
+    The mask `where` selects environments: the rows of the others do not change. The next call overwrites the returned arrays. The
+    caller resets environments whose episode has ended.
     """
 
     stop_requested: Callable[[], bool] = staticmethod(lambda: False)
-    """Whether the user wants to stop. Environments in other processes must then reply soon; `LocalVecEnv` ignores it."""
+    """Whether the user wants to stop. Environments in other processes must then reply soon."""
 
     def __init__(self, spec: EnvSpec, batch: Timestep):
         self.spec = spec
         self.batch = batch
         """The last timestep of each environment."""
         self._length = np.zeros(len(batch.terminated), int)
-        """The steps of each environment's running episode."""
+        """The number of steps of each environment's running episode."""
 
     def reset(self, where: Bool[np.ndarray, " n"], seeds: Integer[np.ndarray, " n"]) -> Timestep:
         """Start an episode in the selected environments."""
         self._call("reset", seeds, where)
         self._length[where] = 0
-        self._check_lengths()
-        return self.batch
+        return self._check_lengths()
 
     def step(
         self, action: Float[np.ndarray, "n agents action"], where: Bool[np.ndarray, " n"] | None = None
@@ -58,11 +57,11 @@ class VecEnv(ABC):
         where = np.ones(len(action), bool) if where is None else where
         self._call("step", action, where)
         self._length[where] += 1
-        self._check_lengths()
-        return self.batch
+        return self._check_lengths()
 
-    def _check_lengths(self) -> None:
+    def _check_lengths(self) -> Timestep:
         check_lengths(self.spec, self._length, np.logical_or(self.batch.terminated, self.batch.truncated))
+        return self.batch
 
     @abstractmethod
     def _call(self, command: str, arguments: Shaped[np.ndarray, "n *rest"], where: Bool[np.ndarray, " n"]) -> None:
@@ -103,7 +102,7 @@ class LocalVecEnv(VecEnv):
 
 
 def make_env_at(env_index: int, maker: Maker) -> HostEnv:
-    """Make an environment. Its errors become one line with its index."""
+    """Make an environment. Raises `LareError` with its index if that fails."""
     with one_line_errors(f"environment {env_index} cannot be made"):
         return maker()
 
@@ -111,23 +110,21 @@ def make_env_at(env_index: int, maker: Maker) -> HostEnv:
 def check_lengths(spec: EnvSpec, length: Integer[np.ndarray, " n"], ended: Bool[np.ndarray, " n"]) -> None:
     """Raise `EnvOutputError` if an episode is longer or shorter than the specification says.
 
-    `length` is the number of steps that each episode has at present, and `ended` says whether it has ended.
+    `length` is the number of steps of each episode until now, and `ended` says whether it has ended.
     """
     at_limit = length >= spec.max_steps
     wrong = (at_limit != ended) if spec.fixed_length else (at_limit & ~ended)
     if wrong.any():
         index = int(np.argmax(wrong))
-        problem = f"the episode has {length[index]} steps and has not ended, but max_steps is {spec.max_steps}"
+        problem = f"has {length[index]} steps and has not ended, but max_steps is {spec.max_steps}"
         if ended[index]:
-            problem = (
-                f"the episode ended after {length[index]} steps, but fixed_length says that all have {spec.max_steps}"
-            )
-        raise EnvOutputError(f"the environment: {problem}", index)
+            problem = f"ended after {length[index]} steps, but fixed_length says that all have {spec.max_steps}"
+        raise EnvOutputError(f"the environment: the episode {problem}", index)
 
 
 def check_jax_env(env: JaxEnv, owner: str) -> None:
-    """Raise `EnvOutputError` if `reset` or `step` returns other arrays than the specification says, or lacks a measure."""
-    import jax  # not in worker processes
+    """Raise `EnvOutputError` if a timestep of `reset` or `step` does not match the specification."""
+    import jax  # worker processes import this module and do without JAX
 
     batch, key = empty_batch(env.spec, 1), jax.random.key(0)
     state, first = jax.eval_shape(env.reset, key)
@@ -160,7 +157,7 @@ def _check_shapes(timestep: Any, batch: Timestep, owner: str, function: str) -> 
 def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: Timestep) -> None:
     """Call "reset" or "step" of an environment, check its timestep, and write it into a row of the batch.
 
-    An `EnvOutputError` has the index as `env_index` alone: the caller's message names the environment.
+    An `EnvOutputError` has the index only as `env_index`: the caller names the environment in the message.
     """
     *columns, measures = batch
     owner = "the environment"
@@ -171,7 +168,9 @@ def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: T
             *values, new_measures = timestep
             for column, value in zip(columns, values, strict=True):
                 column[env_index] = value
-            row = Timestep(*(column[env_index] for column in columns), measures={})  # as float32, which may be infinite
+            row = Timestep(
+                *(column[env_index] for column in columns), measures={}
+            )  # numbers beyond float32 are infinite
             check_finite(row, env.spec, owner)
             for name, value in new_measures.items():
                 if name not in measures:
