@@ -75,8 +75,9 @@ def test_continuous_action_is_scaled_to_the_bounds_of_each_agent():
     env_action = [[[-1, 0], [20, 10]], [[0, 3], [12.5, 10]], [[-1, 4], [20, 10]]]
     np.testing.assert_array_equal(to_env_action(action, spec), env_action)
     np.testing.assert_allclose(to_env_action(jnp.array(action), spec), env_action, rtol=1e-6)
-    whole_bounds = replace(spec, low=low.astype(int), high=high.astype(int))
-    np.testing.assert_array_equal(to_env_action(action, whole_bounds).astype(whole_bounds.action_dtype), env_action)
+    whole = replace(spec, low=np.full((2, 2), -100, np.int8), high=np.full((2, 2), 100, np.int8))
+    np.testing.assert_array_equal(to_env_action(action, whole).astype(whole.action_dtype)[1], [[0, 50], [-50, 0]])
+    assert whole.action_dtype == np.float32
 
 
 # JaxOnHost

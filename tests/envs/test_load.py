@@ -128,7 +128,12 @@ def test_teams_inherit_shared_keys(spec_file, tmp_path):
     (tmp_path / "child.toml").write_text('like = "both.toml"\nteams = ["chase.toml"]\narguments = { n = 4 }\n')
     for name, n in (("both", 3), ("child", 4)):
         (role,) = read_task(tmp_path / f"{name}.toml").teams
-        assert (role.environment, role.scored_observation, role.arguments, role.team) == ("x/y", "both", {"n": n}, "first")
+        assert (role.environment, role.scored_observation, role.arguments, role.team) == (
+            "x/y",
+            "both",
+            {"n": n},
+            "first",
+        )
 
 
 def test_former_names_of_keys(spec_file, tmp_path):

@@ -37,16 +37,12 @@ OPTIONAL_KEYS = ("max_episode_steps", "arguments", "agents")
 
 
 class Family(NamedTuple):
-    """A family of environments."""
+    """A family of environments. `register_family` explains its fields."""
 
     maker: Maker | str
-    """The function that makes the environment of a task, or its location, MODULE:ATTRIBUTE."""
     reads: tuple[str, ...] = ()
-    """The keys of `OPTIONAL_KEYS` that the family reads."""
     score: str | None = None
-    """Whether the returns of all tasks of the family are a "sum" or an "average" over the steps, if that is so."""
     single_agent: bool = False
-    """Whether all environments of the family have one agent."""
 
     @property
     def module(self) -> str:
@@ -133,9 +129,7 @@ def _check_env(task: TaskSpec, env: Any) -> None:
         raise LareError(f"{task.environment}: an environment needs spec, an EnvSpec, and has {short_repr(spec)}")
     agents = [agent for team in spec.teams for agent in range(team.start, team.stop)]
     if not agents or agents != list(range(len(agents))):
-        raise LareError(
-            f"{task.environment}: the teams in EnvSpec must have the agents 0, 1, ... in order: {spec.teams}"
-        )
+        raise LareError(f"{task.environment}: teams in EnvSpec must have the agents 0, 1, ... in order: {spec.teams}")
     kind, names = "JaxEnv", ("reset", "step", "frames")
     if not spec.is_jax:
         kind, names = "HostEnv (without is_jax in its spec)", ("reset", "step", "render", "close")
@@ -228,8 +222,7 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
         _check_bounds(task.environment, spec)
     _check_teams(task, [team.name for team in spec.teams])
     if task.max_episode_steps is not None:
-        limit = f"{spec.max_steps} in {task.environment}. Remove it."
-        _expect(task, "max_episode_steps", spec.max_steps, limit)
+        _expect(task, "max_episode_steps", spec.max_steps, f"{spec.max_steps} in {task.environment}. Remove it.")
     for name in task.info_keys:
         if name not in spec.measures:
             raise _mismatch_error(task, f"{task.environment} has no measure {name!r}")
@@ -238,10 +231,8 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
     for role in task.roles:
         sizes = ("observations", spec.observation_size), ("actions", spec.action_size)
         if task.credit_scope == "state":
-            sizes = (
-                ("states", spec.state_size),
-                ("joint actions", spec.action_size * spec.find_team(role.team).n_agents),
-            )
+            n_agents = spec.find_team(role.team).n_agents
+            sizes = ("states", spec.state_size), ("joint actions", spec.action_size * n_agents)
         for key, (content, size) in zip(("observation_size", "action_size"), sizes, strict=True):
             _expect(role, key, size, f"{task.environment} has {content} of size {size}")
 
@@ -258,14 +249,14 @@ def _check_teams(task: TaskSpec, names: Sequence[str]) -> None:
             raise LareError(f"the teams of {env} must be {', '.join(names)}, in this order")
     elif task.team is None:
         if len(names) > 1:
-            raise LareError(
-                f"{env} has the teams {', '.join(names)}. Write a task file for each, and list them as teams."
-            )
+            teams = ", ".join(names)
+            raise LareError(f"{env} has the teams {teams}. Write a task file for each, and list them as teams.")
     elif task.team not in names:
         raise _mismatch_error(task, f"team = {task.team!r}, but the teams of {env} are {', '.join(names)}")
 
 
 def _expect(role: TaskSpec, key: str, value: Any, reason: str) -> None:
+    """Raise `LareError` with this reason if a key has another value."""
     if getattr(role, key) != value:
         raise _mismatch_error(role, f"{key} = {getattr(role, key)!r}, but {reason}")
 

@@ -88,8 +88,7 @@ class GymnasiumEnv:
         assert isinstance(action_space, Discrete | Box)
         self._agent = Agent("agent", self.environment.observation_space, action_space, observes_mask=False)
         if isinstance(action_space, Box):
-            dtype = np.result_type(action_space.dtype, np.float32)
-            fields: dict[str, Any] = {key: getattr(action_space, key)[None].astype(dtype) for key in ("low", "high")}
+            fields: dict[str, Any] = {"low": action_space.low[None], "high": action_space.high[None]}
         else:
             fields = {"first_choice": int(action_space.start)}
         self.spec = EnvSpec(

@@ -90,6 +90,11 @@ class EnvSpec:
     entry_meanings: Mapping[int, str] = field(default_factory=dict, compare=False)
     """The meanings of entries of an observation, by index, for messages."""
 
+    def __post_init__(self) -> None:
+        for name in ("low", "high"):  # bounds may be integers, but the actions between them are not
+            bounds = getattr(self, name)
+            object.__setattr__(self, name, bounds.astype(np.result_type(bounds.dtype, np.float32)))
+
     @property
     def n_agents(self) -> int:
         return self.teams[-1].stop
@@ -97,7 +102,7 @@ class EnvSpec:
     @property
     def action_dtype(self) -> np.dtype:
         """The type of actions in the environment's units."""
-        return np.result_type(self.low.dtype, np.float32)  # bounds may be integers, actions between them are not
+        return self.low.dtype
 
     def find_team(self, name: str | None) -> Team:
         """Return the team of this name, or the first team if there is none."""

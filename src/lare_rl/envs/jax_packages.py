@@ -38,7 +38,6 @@ __all__ = [
     "mask_combinations",
     "raw_key",
     "read_measures",
-    "strong_types",
     "unusable",
 ]
 
@@ -113,13 +112,8 @@ def flat_size(tree: Any) -> int:
     return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
 
 
-def strong_types(tree: Any) -> Any:
-    """Return a tree of arrays without weak types, because a compiled step returns none."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype), tree)
-
-
 def cast_like(tree: Any, reference: Any) -> Any:
-    """Return a tree with the types of a reference of the same structure, so that a state has the same types at all steps."""
+    """Return a tree with the types of a reference, without weak types, so that a state has the same types at all steps."""
     return jax.tree.map(lambda leaf, other: jnp.asarray(leaf, jnp.asarray(other).dtype), tree, reference)
 
 
@@ -215,7 +209,7 @@ class AgentEnv:
 
     def reset(self, key: PRNGKeyArray) -> tuple[Any, Timestep]:
         state, outputs = self._reset(raw_key(key))
-        return strong_types(state), agent_timestep(self.spec, **outputs)
+        return cast_like(state, state), agent_timestep(self.spec, **outputs)
 
     def step(self, state: Any, action: Float[Array, "1 action"], key: PRNGKeyArray) -> tuple[Any, Timestep]:
         next_state, outputs = self._step(state, to_package_action(action[0], self.spec), raw_key(key))

@@ -96,7 +96,7 @@ class JaxMARLEnv:
     def reset(self, key: PRNGKeyArray) -> tuple[JaxMARLState, Timestep]:
         observations, env_state = self.env.reset(jax_packages.raw_key(key))
         alive = jnp.ones(self.spec.n_agents, bool)
-        state = JaxMARLState(jax_packages.strong_types(env_state), jnp.zeros((), jnp.int32), alive)
+        state = JaxMARLState(jax_packages.cast_like(env_state, env_state), jnp.zeros((), jnp.int32), alive)
         return state, self._make_timestep(observations, state, jnp.zeros(self.spec.n_agents), jnp.zeros((), bool), {})
 
     def step(

@@ -19,7 +19,7 @@ from lare_rl.envs.env_errors import close_env
 from lare_rl.envs.families import GYMNASIUM, find_family, make_env, make_local_env, picklable_maker
 from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
 from lare_rl.envs.trials import time_steps
-from lare_rl.envs.vec_env import LocalVecEnv, VecEnv, select_row
+from lare_rl.envs.vec_env import LocalVecEnv, VecEnv, first_timestep
 from lare_rl.envs.workers import SubprocVecEnv
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec, split_environment
@@ -67,10 +67,10 @@ class SeparateEnv:
         self.spec = self.envs.spec
 
     def reset(self, seed: int) -> Timestep:
-        return select_row(self.envs.reset(np.ones(1, bool), np.array([seed])))
+        return first_timestep(self.envs.reset(np.ones(1, bool), np.array([seed])))
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
-        return select_row(self.envs.step(action[None]))
+        return first_timestep(self.envs.step(action[None]))
 
     def render(self) -> NoReturn:
         raise LareError("an environment in a process of its own cannot be drawn")

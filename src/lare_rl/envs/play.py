@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from lare_rl.envs.env_errors import name_step
 from lare_rl.envs.interface import EnvSpec, HostEnv, Team, Timestep, team_mean, to_env_action
 from lare_rl.envs.placement import make_host_env
-from lare_rl.envs.vec_env import LocalVecEnv, select_row
+from lare_rl.envs.vec_env import LocalVecEnv, first_timestep
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import CreditScope, TaskSpec
 
@@ -144,12 +144,12 @@ def play_steps(
         policy = policy.select_env_action
     envs = LocalVecEnv([lambda: env])  # it checks every timestep
     with name_step(0):
-        next_timestep = select_row(envs.reset(np.ones(1, bool), np.array([seed])))
+        next_timestep = first_timestep(envs.reset(np.ones(1, bool), np.array([seed])))
     for number in itertools.count(1):
         timestep = next_timestep
         action = sample_action(env.spec, timestep, rng) if policy is None else _act(policy, env.spec, timestep)
         with name_step(number):
-            next_timestep = select_row(envs.step(action[None]))
+            next_timestep = first_timestep(envs.step(action[None]))
         yield timestep, action, next_timestep
         if next_timestep.terminated or next_timestep.truncated:
             return

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,8 @@ __all__ = [
     "check_lengths",
     "check_same_sizes",
     "empty_batch",
+    "first_timestep",
     "make_env_at",
-    "select_row",
 ]
 
 Maker = Callable[[], HostEnv]
@@ -183,31 +184,28 @@ def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: T
 
 def check_same_sizes(specs: Sequence[EnvSpec]) -> None:
     """Raise `LareError` if environments have different sizes."""
-    first, *rest = map(_sizes, specs)
+    read_sizes = attrgetter("teams", "observation_size", "action_size", "discrete", "state_size", "measures")
+    first, *rest = map(read_sizes, specs)
     for env_index, sizes in enumerate(rest, 1):
         if sizes != first:
             raise LareError(f"environment {env_index} differs from environment 0: {sizes}, not {first}")
 
 
-def _sizes(spec: EnvSpec) -> tuple[Any, ...]:
-    return spec.teams, spec.observation_size, spec.action_size, spec.discrete, spec.state_size, spec.measures
-
-
-def empty_batch(spec: EnvSpec, *lead: int) -> Timestep:
-    """Return the timesteps of environments before their first reset, as arrays of shape `lead`."""
+def empty_batch(spec: EnvSpec, *batch_shape: int) -> Timestep:
+    """Return the timesteps of a batch of environments before their first reset."""
     return Timestep(
-        observation=np.zeros((*lead, spec.n_agents, spec.observation_size), np.float32),
-        state=np.zeros((*lead, spec.state_size), np.float32),
-        available=np.ones((*lead, spec.n_agents, spec.action_size), bool),
-        alive=np.zeros((*lead, spec.n_agents), bool),
-        reward=np.zeros((*lead, spec.n_agents), np.float32),
-        terminated=np.zeros(lead, bool),
-        truncated=np.zeros(lead, bool),
-        measures={name: np.zeros(lead, np.float32) for name in spec.measures},
+        observation=np.zeros((*batch_shape, spec.n_agents, spec.observation_size), np.float32),
+        state=np.zeros((*batch_shape, spec.state_size), np.float32),
+        available=np.ones((*batch_shape, spec.n_agents, spec.action_size), bool),
+        alive=np.zeros((*batch_shape, spec.n_agents), bool),
+        reward=np.zeros((*batch_shape, spec.n_agents), np.float32),
+        terminated=np.zeros(batch_shape, bool),
+        truncated=np.zeros(batch_shape, bool),
+        measures={name: np.zeros(batch_shape, np.float32) for name in spec.measures},
     )
 
 
-def select_row(batch: Timestep) -> Timestep:
+def first_timestep(batch: Timestep) -> Timestep:
     """Return a copy of the timestep of the first environment of a batch."""
     *columns, measures = batch
     return Timestep(*(column[0].copy() for column in columns), {name: value[0] for name, value in measures.items()})  # pyright: ignore[reportCallIssue]

@@ -41,7 +41,6 @@ class Size:
     n_agents: int
     """Also the number of landmarks."""
     half_side: float
-    """Half the side of the square."""
 
     @property
     def agents(self) -> range:

@@ -132,7 +132,7 @@ def distances(position: Float[Array, "units 2"]) -> Float[Array, "units units"]:
 
 
 def within_reach(scenario: Scenario, battle: Battle) -> Bool[Array, "units units"]:
-    """Return whether the first unit could hit the second: both are alive, and the distance is small enough."""
+    """Return at [i, j] whether unit i could hit unit j: both are alive, and the distance is small enough."""
     is_alive = alive(battle)
     return (distances(battle.position) < scenario.unit_stats("attack_range")[:, None]) & is_alive[:, None] & is_alive
 
