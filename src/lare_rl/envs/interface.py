@@ -144,12 +144,15 @@ class JaxEnv(Protocol[State]):
 
     def reset(self, key: Any) -> tuple[State, Timestep]:
         """Start an episode."""
+        ...
 
     def step(self, state: State, action: Float[AnyArray, "agents action"], key: Any) -> tuple[State, Timestep]:
         """Make one step. Continuous actions are in the environment's units, discrete actions are one-hot."""
+        ...
 
     def frames(self, states: State, credit: Float[np.ndarray, "steps agents"] | None = None) -> list[Frame]:
         """Return an episode's states (leading axis: steps) as pictures, with each agent's credit."""
+        ...
 
 
 @runtime_checkable
@@ -160,12 +163,15 @@ class HostEnv(Protocol):
 
     def reset(self, seed: int) -> Timestep:
         """Start an episode. The same seed gives the same episode."""
+        ...
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
         """Make one step. Continuous actions are in the environment's units, discrete actions are one-hot."""
+        ...
 
     def render(self) -> Frame:
         """Return a picture of the environment."""
+        ...
 
     def close(self) -> None:
         """Release the resources of the environment."""

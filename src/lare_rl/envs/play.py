@@ -35,9 +35,11 @@ class StatefulPolicy(Protocol):
 
     def reset(self) -> None:
         """Begin a new episode."""
+        ...
 
     def select_env_action(self, observation: Any, available: Any = None) -> np.ndarray:
         """Return the action for one observation, in the environment's units."""
+        ...
 
 
 Policy = Callable[..., np.ndarray] | StatefulPolicy
