@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from helpers.host_envs import ToyHostEnv
+from helpers.jax_toy_envs import Echo
 from helpers.toy_envs import toy_spec
-from lare_rl.envs.families import find_score_type, make_env, register_family
+from lare_rl.envs.families import find_score_type, make_env, make_local_env, register_family
 from lare_rl.envs.interface import EnvSpec, Team
+from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.load import read_task
 from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
@@ -146,6 +148,23 @@ def test_tasks_that_do_not_agree(changes, content):
 # Making environments
 
 
+class Drawn(Echo):
+    """A `JaxEnv` that has the functions of a `HostEnv` too."""
+
+    def __init__(self, task):
+        super().__init__()
+
+    def render(self): ...
+
+    def close(self): ...
+
+
+def test_jax_env_with_the_functions_of_a_host_env():
+    register_family("drawn", Drawn)
+    sizes = {"observation_size": Echo.spec.observation_size, "action_size": Echo.spec.action_size}
+    assert isinstance(make_local_env(toy_spec(environment="drawn/x", **sizes)), JaxOnHost)
+
+
 def make_toy_task(**changes) -> TaskSpec:
     return toy_spec(**{"environment": "logged/two", "action_size": 2} | changes)
 
@@ -192,6 +211,8 @@ def test_sizes_are_read_once(log):
         ({"low": np.full((2, 2), 2, np.float32)}, "low <= high"),
         ({"low": -WIDEST, "high": WIDEST}, "finite high - low"),
         (None, "an EnvSpec, and has None"),
+        ({"teams": ()}, "agents 0, 1, ... in order"),
+        ({"teams": (Team("cat", 0, 1), Team("mouse", 2, 3))}, "must have the agents 0, 1"),
     ],
 )
 def test_spec_is_checked(changes, message):
@@ -200,7 +221,7 @@ def test_spec_is_checked(changes, message):
             super().__init__(changes=changes)
             self.spec = self.spec if changes else None
 
-    name = f"unbounded-{len(message)}"
+    name = "unbounded-" + "".join(filter(str.isalnum, message))
     register_family(name, Unbounded)
     with pytest.raises(LareError, match=message):
         make_env(toy_spec(environment=f"{name}/two", observation_size=2, action_size=2))

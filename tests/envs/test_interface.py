@@ -75,6 +75,11 @@ def test_continuous_action_is_scaled_to_the_bounds_of_each_agent():
     env_action = [[[-1, 0], [20, 10]], [[0, 3], [12.5, 10]], [[-1, 4], [20, 10]]]
     np.testing.assert_array_equal(to_env_action(action, spec), env_action)
     np.testing.assert_allclose(to_env_action(jnp.array(action), spec), env_action, rtol=1e-6)
+    int8_spec = replace(spec, low=np.full((2, 2), -100, np.int8), high=np.full((2, 2), 100, np.int8))
+    np.testing.assert_array_equal(
+        to_env_action(action, int8_spec).astype(int8_spec.action_dtype)[1], [[0, 50], [-50, 0]]
+    )
+    assert int8_spec.action_dtype == np.float32
 
 
 # JaxOnHost

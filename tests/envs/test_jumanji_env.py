@@ -6,7 +6,7 @@ import pytest
 
 from helpers.jax_families import check_arrays, family_task, play, require_family, step_keys
 from lare_rl.envs.interface import to_package_action
-from lare_rl.envs.jax_spaces import mask_combinations
+from lare_rl.envs.jax_packages import mask_combinations
 from lare_rl.envs.jumanji_env import make
 
 require_family("jumanji")

@@ -61,6 +61,7 @@ def test_task_file(spec_file):
         ({"action_size": 0}, "action_size = 0"),
         ({"like": ["PP-6"]}, r"like = \['PP-6'\] must be"),
         ({"teams": [3]}, r"teams = \[3\] must be"),
+        ({"like": "\0"}, r"like = '\\x00' must be"),
         ({"like": "Reacher"}, "did you mean 'Reacher-v5'"),
         ({"environment": "CartPole-v1", "observation_size": 4}, "action_size = 1, but .* actions of size 2"),
         ({"environment": "toys/Endless-v0"}, "no time limit.*max_episode_steps"),
@@ -124,8 +125,15 @@ def test_teams_inherit_shared_keys(spec_file, tmp_path):
         'like = "Reacher-v4"\nname = "Both"\nenvironment = "x/y"\nteams = ["chase.toml"]\nscored_observation = "both"\n'
         "arguments = { n = 3 }\n"
     )
-    (role,) = read_task(tmp_path / "both.toml").teams
-    assert (role.environment, role.scored_observation, role.arguments, role.team) == ("x/y", "both", {"n": 3}, "first")
+    (tmp_path / "child.toml").write_text('like = "both.toml"\nteams = ["chase.toml"]\narguments = { n = 4 }\n')
+    for name, n in (("both", 3), ("child", 4)):
+        (role,) = read_task(tmp_path / f"{name}.toml").teams
+        assert (role.environment, role.scored_observation, role.arguments, role.team) == (
+            "x/y",
+            "both",
+            {"n": n},
+            "first",
+        )
 
 
 def test_former_names_of_keys(spec_file, tmp_path):

@@ -107,7 +107,7 @@ def test_repeated_crashes_end_the_run():
         with nullcontext() if seed == 2 else pytest.warns(RuntimeWarning):
             env.step(STOP)
     env.reset(5)
-    with pytest.raises(LareError, match=r"crashed .* 3rd time"):
+    with pytest.raises(LareError, match=r"crashed .* 3 times in a row"):
         env.step(STOP)
 
 
@@ -133,6 +133,9 @@ def test_errors(write_package, monkeypatch, tmp_path):
     env.reset(0)
     with pytest.raises(LareError, match=r"in a step of '2s3z': .*not available"):
         env.step(np.eye(11, dtype=np.float32)[[0] * 5])
+    monkeypatch.setattr(FakeSmac, "render", lambda self, mode: 1 / 0)
+    with pytest.raises(LareError, match="cannot draw '2s3z': division"):
+        env.render()
 
     def fail(**_):
         raise KeyError("no map\n2s3y")

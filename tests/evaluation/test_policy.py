@@ -12,7 +12,7 @@ from helpers.toy_envs import toy_spec
 from lare_rl.config.resolve import resolve
 from lare_rl.envs.families import register_family
 from lare_rl.envs.interface import EnvSpec, Team
-from lare_rl.envs.jax_spaces import agent_timestep
+from lare_rl.envs.jax_packages import agent_timestep
 from lare_rl.errors import LareError
 from lare_rl.evaluation.policy import load_policy
 from lare_rl.runs.directory import create_run

@@ -13,7 +13,7 @@ from helpers.small_configs import ONE_AGENT, SMALL_SETTINGS, small_config
 from lare_rl.algorithms.qmix import qmix
 from lare_rl.algorithms.td3 import TD3Settings
 from lare_rl.envs.families import register_family
-from lare_rl.envs.jax_spaces import agent_timestep
+from lare_rl.envs.jax_packages import agent_timestep
 from lare_rl.errors import LareError
 from lare_rl.training import collect_device
 from lare_rl.training.collect_device import DeviceCollector, make_jax_env, unroll_on_device

@@ -45,7 +45,7 @@ class Agent:
         return isinstance(self.action_space, Discrete)
 
     def decode_action(self, action: Float[np.ndarray, " action"]) -> Any:
-        """Return the action that a padded vector encodes, in the form that the environment expects. Integers are rounded."""
+        """Return the action that a padded vector encodes, as a value of the action space. Actions of an integer Box are rounded."""
         action, space = action[: self.action_size], self.action_space
         if isinstance(space, Discrete):
             return int(space.start) + int(np.argmax(action))
@@ -61,9 +61,9 @@ class Agent:
         return flatten_value(self.observation_space, observation["observation"])
 
     def read_mask(self, observation: Any, info: Any) -> Bool[np.ndarray, " action"] | None:
-        """Return which actions are available, from the observation or from `info`. Return None without a mask.
+        """Return which actions are available, from the observation or from `info`, or None if neither has a mask.
 
-        Raises `ValueError` with the predicate of a sentence if the mask is not valid.
+        Raises `ValueError`, whose message is a predicate, if the mask is not valid.
         """
         mask = observation[MASK] if self.observes_mask else info.get(MASK) if isinstance(info, Mapping) else None
         if mask is None:
@@ -79,7 +79,7 @@ class Agent:
 
 
 def make_agent(name: Any, observation: gymnasium.Space, action: gymnasium.Space) -> Agent:
-    """Make an agent from its spaces. Raises `LareError` if they cannot be flattened."""
+    """Make an agent from its spaces. Raises `LareError` if training cannot use them."""
     observes_mask = isinstance(observation, Dict) and set(observation.spaces) == {"observation", MASK}
     if isinstance(observation, Dict) and observes_mask:
         observation = observation["observation"]
@@ -91,10 +91,10 @@ def make_agent(name: Any, observation: gymnasium.Space, action: gymnasium.Space)
 
 
 class AgentArrays:
-    """The layout of common arrays. If the spaces of agents differ, each observation ends with the agent's index, one-hot encoded."""
+    """The layout of common arrays. If the spaces of agents differ, each observation ends with the agent's index, one-hot."""
 
     def __init__(self, agents: Sequence[Agent]):
-        """Make the layout, with the agents in order. Raises `LareError` if only some of them have discrete actions."""
+        """Make the layout of agents in this order. Raises `LareError` if only some of them have discrete actions."""
         first = agents[0]
         for agent in agents[1:]:
             if agent.discrete != first.discrete:
@@ -114,7 +114,7 @@ class AgentArrays:
 
     @property
     def available(self) -> Bool[np.ndarray, "agents action"]:
-        """The actions of each agent without a mask. All are true for continuous actions."""
+        """The available actions of each agent if no mask says otherwise. All true for continuous actions."""
         sizes = np.array([agent.action_size if self.discrete else self.action_size for agent in self.agents])
         return np.arange(self.action_size) < sizes[:, None]
 
@@ -138,14 +138,14 @@ class AgentArrays:
             discrete=self.discrete,
             low=low,
             high=high,
-            agents_leave=True,  # no environment states that they do not
+            agents_leave=True,  # no package says that they do not
             **fields,
         )
 
     def pad_observations(
         self, observations: Mapping[int, Float[np.ndarray, " _"]]
     ) -> Float[np.ndarray, "agents observation"]:
-        """Return flat observations, by the agents' indices, in one array. All else is 0."""
+        """Return flat observations in one array, by the agents' indices, padded with 0. Agents without an observation observe 0."""
         padded = np.zeros((len(self.agents), self.observation_size), np.float32)
         for index, observation in observations.items():
             padded[index, : len(observation)] = observation

@@ -1,4 +1,4 @@
-"""Pictures by Matplotlib without a window: a square figure to draw on, and the pixels of any figure."""
+"""Pictures by Matplotlib, without a window."""
 
 from collections.abc import Callable
 
@@ -31,7 +31,7 @@ def blank_figure() -> tuple[Figure, Axes]:
 
 
 def paint_frames(n_frames: int, paint: Callable[[Axes, int], None]) -> list[Frame]:
-    """Return pictures. `paint` draws the picture of an index on empty axes."""
+    """Return pictures. `paint` draws the picture with an index on empty axes."""
     figure, axes = blank_figure()
     frames = []
     for index in range(n_frames):

@@ -1,9 +1,9 @@
-"""Errors of environments as `LareError`s of one line. An environment is foreign code, which may raise or return anything."""
+"""Errors of environments as `LareError`s of one line, because an environment is foreign code that may raise or return anything."""
 
 import contextlib
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,7 @@ __all__ = [
     "as_lare_error",
     "check_finite",
     "close_env",
+    "convert_output",
     "import_hint",
     "name_step",
     "no_time_limit_error",
@@ -25,12 +26,14 @@ __all__ = [
     "to_float",
 ]
 
+T = TypeVar("T")
+
 MAX_ERROR = 300
 """Characters of an environment's error that a message quotes."""
 
 
 class EnvOutputError(LareError):
-    """An environment returned a value that cannot be used for training. `env_index` is its index, if several run in lockstep."""
+    """An environment returned a value that training cannot use. `env_index` is its index, if several run in lockstep."""
 
     def __init__(self, message: str, env_index: int | None = None):
         super().__init__(message)
@@ -38,7 +41,7 @@ class EnvOutputError(LareError):
 
 
 def as_lare_error(message: str, error: BaseException, hint: str = "") -> LareError:
-    """Return `message`, the error in one line, and the hint as a `LareError`. Return a `LareError` unchanged."""
+    """Return a `LareError` with `message`, the error's text in one line, and the hint. Return a `LareError` unchanged."""
     if isinstance(error, LareError):
         return error
     logging.getLogger(__name__).debug("%s", message, exc_info=error)
@@ -51,7 +54,7 @@ def as_lare_error(message: str, error: BaseException, hint: str = "") -> LareErr
 def one_line_errors(message: str, make_hint: Callable[[BaseException], str] = lambda _: "") -> Iterator[None]:
     """Turn every error of a block into a `LareError` that begins with `message`.
 
-    This includes `SystemExit`, which some programs raise when a window is closed. Otherwise an interrupted run would look complete.
+    This includes `SystemExit`, which some programs raise when a window is closed: the run must not look complete then.
     """
     try:
         yield
@@ -68,7 +71,7 @@ def close_env(env: Any, label: str) -> None:
 
 
 def import_hint(error: BaseException) -> str:
-    """Return how to make a missing module available, in brackets; an empty text for another error."""
+    """Return how to make a missing module available, in brackets, or an empty text for other errors."""
     if not isinstance(error, ModuleNotFoundError):
         return ""
     package = (error.name or "").partition(".")[0]
@@ -79,7 +82,7 @@ def import_hint(error: BaseException) -> str:
 
 @contextlib.contextmanager
 def name_step(number: int) -> Iterator[None]:
-    """Add the step of the episode to an `EnvOutputError` of a block; 0 is the reset."""
+    """Add the number of the step to an `EnvOutputError` of a block. The reset has the number 0."""
     try:
         yield
     except EnvOutputError as error:
@@ -106,6 +109,14 @@ def no_time_limit_error(task: TaskSpec) -> LareError:
     )
 
 
+def convert_output(convert: Callable[[Any], T], value: Any, subject: str) -> T:
+    """Return a converted value of an environment. A `ValueError`, whose message is a predicate, becomes an `EnvOutputError`."""
+    try:
+        return convert(value)
+    except ValueError as error:
+        raise EnvOutputError(f"{subject} {error}") from None
+
+
 def to_float(value: Any) -> float:
     """Return a value as a float. Raises `ValueError`, whose message is a predicate, if it is not a number."""
     try:
@@ -117,10 +128,10 @@ def to_float(value: Any) -> float:
 def read_measures(
     infos: Sequence[Mapping[Any, Any]], task: TaskSpec, *, last: bool
 ) -> dict[str, Float[np.ndarray, ""]]:
-    """Return the measures of the task from the `info` of a step: the means over the agents that report them.
+    """Return the measures and the group of the task from each agent's `info`: the means over the agents that report them.
 
-    They are 0 before the last step, except the group of the episode, if it is reported. Raises `LareError` if a measure of the last
-    step is missing, or is not a number, or if the group is not valid.
+    Before the last step, measures are 0, and so is a group that no agent reports. Raises `LareError` if a value of the last step is
+    missing or not a number, or if the group is not valid.
     """
     measures = {}
     for name in task.info_keys:

@@ -13,14 +13,13 @@ from lare_rl.errors import LareError
 __all__ = ["TRUE_REWARD", "EpisodicReward", "read_score"]
 
 TRUE_REWARD = "true_reward"
-"""The key of `info` for the true reward of the step."""
+"""The key of `info` with the true reward of the step."""
 
 
 class EpisodicReward(gymnasium.Wrapper, RecordConstructorArgs):
-    """Replaces the reward by 0 until the last step of an episode, and there by the sum of all its rewards.
+    """Replaces the reward by the sum of the episode's rewards at its last step, and by 0 before.
 
-    The true reward of each step stays in `info["true_reward"]`. This must be the outermost wrapper that changes rewards
-    or ends episodes.
+    `info["true_reward"]` is the true reward of each step. This must be the outermost wrapper that changes rewards or ends episodes.
 
     >>> environment = EpisodicReward(gymnasium.make("Reacher-v5"))
     >>> _ = environment.reset(seed=0)
@@ -34,7 +33,7 @@ class EpisodicReward(gymnasium.Wrapper, RecordConstructorArgs):
         """Wrap an environment.
 
         Args:
-            score: a key of the last step's `info` with the score of the episode, which replaces the sum of rewards.
+            score: a key of the last step's `info`, whose value replaces the sum of rewards.
         """
         RecordConstructorArgs.__init__(self, score=score)
         gymnasium.Wrapper.__init__(self, env)
@@ -56,7 +55,7 @@ class EpisodicReward(gymnasium.Wrapper, RecordConstructorArgs):
 
 
 def read_score(info: Mapping[str, Any], key: str) -> float:
-    """Return the score of an episode from the `info` of its last step. Raises `LareError` if it is no finite number."""
+    """Return the score of an episode from the `info` of its last step. Raises `LareError` if it is not a finite number."""
     if key not in info:
         raise LareError(f"the info of the last step has no {key!r}: it has {', '.join(map(repr, info)) or 'nothing'}")
     try:

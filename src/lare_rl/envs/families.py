@@ -4,9 +4,10 @@ The part of the name before the first slash is the family. All names without a r
 """
 
 import importlib
+import pkgutil
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -32,20 +33,16 @@ __all__ = [
 Maker = Callable[..., JaxEnv | HostEnv]
 
 OPTIONAL_KEYS = ("max_episode_steps", "arguments", "agents")
-"""Keys of a task that only some families read. Other families refuse them, because ignoring them would mislead the user."""
+"""Keys of a task that only some families read. Tasks of other families must not have them, because they would have no effect."""
 
 
 class Family(NamedTuple):
-    """A family of environments."""
+    """A family of environments. `register_family` explains its fields."""
 
     maker: Maker | str
-    """The function that makes the environment of a task, or its location, MODULE:ATTRIBUTE, which is imported when needed."""
     reads: tuple[str, ...] = ()
-    """The keys of `OPTIONAL_KEYS` that the family reads."""
     score: str | None = None
-    """Whether the return of all tasks of the family is a "sum" or an "average" over the steps, if known."""
     single_agent: bool = False
-    """Whether all environments of the family have one agent."""
 
     @property
     def module(self) -> str:
@@ -53,10 +50,8 @@ class Family(NamedTuple):
         return self.maker.partition(":")[0] if isinstance(self.maker, str) else self.maker.__module__
 
     def load_maker(self) -> Maker:
-        """Return the maker. Its module is imported now if only its location is known."""
-        if isinstance(self.maker, str):
-            return getattr(importlib.import_module(self.module), self.maker.partition(":")[2])
-        return self.maker
+        """Return the maker, imported from its location if it has one."""
+        return pkgutil.resolve_name(self.maker) if isinstance(self.maker, str) else self.maker
 
 
 FAMILIES = Registry[Family]("family of environments", "families of environments")
@@ -73,15 +68,15 @@ def register_family(
         name: the part of the environment's name before the first slash.
         maker: a function or class that is called with the `TaskSpec`, and with `render_mode="rgb_array"` for films. It returns a
             `JaxEnv` or a `HostEnv`. The text "MODULE:ATTRIBUTE" is imported when the first environment is made.
-        reads: the keys among "max_episode_steps", "arguments" and "agents" that the maker reads. Tasks with the others are refused.
+        reads: the keys among "max_episode_steps", "arguments" and "agents" that the maker reads. A task must not have the others.
         score: "sum" or "average" if the returns of all tasks of the family are sums or averages over the steps.
         single_agent: whether all environments of the family have one agent.
 
     Raises:
-        LareError: another family has this name, or an argument has no such value.
+        LareError: another family has this name, or the value of `reads` or `score` is not valid.
     """
     if isinstance(reads, str) or not set(reads) <= set(OPTIONAL_KEYS):
-        raise LareError(f"family {name}: reads = {reads!r}: give a tuple of some of {', '.join(OPTIONAL_KEYS)}")
+        raise LareError(f"family {name}: reads = {reads!r}: give a tuple of keys among {', '.join(OPTIONAL_KEYS)}")
     if score not in (None, "sum", "average"):
         raise LareError(f'family {name}: score = {score!r}: give "sum", "average" or None')
     FAMILIES.register(name, Family(maker, tuple(reads), score, single_agent))
@@ -116,22 +111,25 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
     _check_env(task, env)
     try:
         _check_spec(task, env.spec)
-        if task.evaluation_environment is not None and not isinstance(env, HostEnv):
+        if task.evaluation_environment is not None and env.spec.is_jax:
             raise LareError(
                 f"task {task.name!r}: evaluation_environment has no effect on {task.environment}. Remove it."
             )
     except LareError:
-        if isinstance(env, HostEnv):
+        if not env.spec.is_jax:
             close_env(env, f"environment {task.environment!r}")
         raise
     return env
 
 
 def _check_env(task: TaskSpec, env: Any) -> None:
-    """Raise `LareError` if an environment lacks its spec or a function of its kind."""
+    """Raise `LareError` if an environment has no valid spec, or lacks a function of its kind."""
     spec = getattr(env, "spec", None)
     if not isinstance(spec, EnvSpec):
         raise LareError(f"{task.environment}: an environment needs spec, an EnvSpec, and has {short_repr(spec)}")
+    agents = [agent for team in spec.teams for agent in range(team.start, team.stop)]
+    if not agents or agents != list(range(len(agents))):
+        raise LareError(f"{task.environment}: teams in EnvSpec must have the agents 0, 1, ... in order: {spec.teams}")
     kind, names = "JaxEnv", ("reset", "step", "frames")
     if not spec.is_jax:
         kind, names = "HostEnv (without is_jax in its spec)", ("reset", "step", "render", "close")
@@ -142,15 +140,15 @@ def _check_env(task: TaskSpec, env: Any) -> None:
 def make_local_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
     """Make a task's environment as a `HostEnv` in this process, even if it is a `JaxEnv`. See `make_env`."""
     env = make_env(task, **kwargs)
-    if isinstance(env, HostEnv):
-        return env
+    if not env.spec.is_jax:
+        return cast("HostEnv", env)
     from lare_rl.envs.jax_on_host import JaxOnHost
 
-    return JaxOnHost(env)
+    return JaxOnHost(cast("JaxEnv", env))
 
 
 def picklable_maker(task: TaskSpec) -> Callable[[], HostEnv]:
-    """Return a function that makes a task's environment in another process, which first imports the module of its family."""
+    """Return a function that makes a task's environment in another process, where it first imports the module of its family."""
     return partial(_import_and_make, find_family(task).module, task)
 
 
@@ -222,37 +220,46 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
     """Raise `LareError` if the bounds of actions cannot be used, or at the first mismatch between a task and its environment."""
     if not spec.discrete:
         _check_bounds(task.environment, spec)
+    _check_teams(task, [team.name for team in spec.teams])
+    if task.max_episode_steps is not None:
+        _expect(task, "max_episode_steps", spec.max_steps, f"{spec.max_steps} in {task.environment}. Remove it.")
+    for name in task.info_keys:
+        if name not in spec.measures:
+            raise _mismatch_error(task, f"{task.environment} has no measure {name!r}")
+    if task.credit_scope == "state" and not spec.state_size:
+        raise _mismatch_error(task, f"credit_scope = 'state', but {task.environment} has no global state")
+    for role in task.roles:
+        sizes = ("observations", spec.observation_size), ("actions", spec.action_size)
+        if task.credit_scope == "state":
+            n_agents = spec.find_team(role.team).n_agents
+            sizes = ("states", spec.state_size), ("joint actions", spec.action_size * n_agents)
+        for key, (content, size) in zip(("observation_size", "action_size"), sizes, strict=True):
+            _expect(role, key, size, f"{task.environment} has {content} of size {size}")
 
-    def fail(role: TaskSpec, mismatch: str) -> LareError:
-        return LareError(f"task {role.name!r}: {mismatch}")
 
-    def expect(role: TaskSpec, key: str, value: Any, reason: str) -> None:
-        if getattr(role, key) != value:
-            raise fail(role, f"{key} = {getattr(role, key)!r}, but {reason}")
-
-    env, names = task.environment, [team.name for team in spec.teams]
-    if task.teams and [role.team for role in task.teams] != names:
-        raise LareError(f"the teams of {env} must be {', '.join(names)}, in this order")
-    if len(names) > 1 and not task.teams and task.team is None:
-        raise LareError(f"{env} has the teams {', '.join(names)}. Write a task file for each, and list them as teams.")
+def _check_teams(task: TaskSpec, names: Sequence[str]) -> None:
+    """Raise `LareError` if the teams of a task do not match those of its environment, which have these names."""
+    env = task.environment
     for role in task.teams:
         for key in SHARED_KEYS:  # training reads only the task's keys, verification only the team's
             value = getattr(task, key)
-            expect(role, key, value, f"{value!r} in {task.name!r}. Use the same value in both.")
-    if not task.teams and task.team not in (None, *names):
-        raise fail(task, f"team = {task.team!r}, but the teams of {env} are {', '.join(names)}")
-    if task.max_episode_steps is not None:
-        expect(task, "max_episode_steps", spec.max_steps, f"{spec.max_steps} in {env}. Remove it.")
-    for name in task.info_keys:
-        if name not in spec.measures:
-            raise fail(task, f"{env} has no measure {name!r}")
-    from_state = task.credit_scope == "state"
-    if from_state and not spec.state_size:
-        raise fail(task, f"credit_scope = 'state', but {env} has no global state")
-    for role in task.roles:
-        team = spec.teams[names.index(role.team)] if role.team in names else spec.teams[0]
-        sizes = ("observations", spec.observation_size), ("actions", spec.action_size)
-        if from_state:
-            sizes = ("states", spec.state_size), ("joint actions", spec.action_size * team.n_agents)
-        for key, (content, size) in zip(("observation_size", "action_size"), sizes, strict=True):
-            expect(role, key, size, f"{env} has {content} of size {size}")
+            _expect(role, key, value, f"{value!r} in {task.name!r}. Use the same value in both.")
+    if task.teams:
+        if [role.team for role in task.teams] != names:
+            raise LareError(f"the teams of {env} must be {', '.join(names)}, in this order")
+    elif task.team is None:
+        if len(names) > 1:
+            teams = ", ".join(names)
+            raise LareError(f"{env} has the teams {teams}. Write a task file for each, and list them as teams.")
+    elif task.team not in names:
+        raise _mismatch_error(task, f"team = {task.team!r}, but the teams of {env} are {', '.join(names)}")
+
+
+def _expect(role: TaskSpec, key: str, value: Any, reason: str) -> None:
+    """Raise `LareError` with this reason if a key has another value."""
+    if getattr(role, key) != value:
+        raise _mismatch_error(role, f"{key} = {getattr(role, key)!r}, but {reason}")
+
+
+def _mismatch_error(role: TaskSpec, mismatch: str) -> LareError:
+    return LareError(f"task {role.name!r}: {mismatch}")

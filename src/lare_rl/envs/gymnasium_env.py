@@ -12,8 +12,8 @@ from jaxtyping import Float
 from lare_rl.envs import mujoco_rewards
 from lare_rl.envs.agent_arrays import Agent
 from lare_rl.envs.env_errors import (
-    EnvOutputError,
     close_env,
+    convert_output,
     import_hint,
     no_time_limit_error,
     one_line_errors,
@@ -36,7 +36,7 @@ mujoco_rewards.register()
 def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: Any) -> gymnasium.Env:
     """Make an environment. See `gymnasium.make` for the arguments.
 
-    Raises `LareError` if it cannot be made, or its spaces cannot be flattened.
+    Raises `LareError` if it cannot be made, or training cannot use its spaces.
     """
 
     def make_hint(error: BaseException) -> str:
@@ -55,10 +55,10 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
         # The user chooses the version: returns of v4 and v5 cannot be compared.
         warnings.filterwarnings("ignore", message=".*is out of date.*", category=DeprecationWarning)
         warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
-        # A report asks for a film, and does without one if it gets none.
+        # A report asks every environment for a film, and does without it.
         warnings.filterwarnings("ignore", message=".*that is not in the possible render_modes.*")
         if (spec := gymnasium.registry.get(name)) and str(spec.entry_point).startswith("gymnasium.envs.mujoco"):
-            importlib.import_module("mujoco")  # if parts of it are missing, only this says how to repair that
+            importlib.import_module("mujoco")  # its errors say what is missing, those of Gymnasium do not
         with mujoco_warnings(name):
             env = gymnasium.make(name, max_episode_steps=max_episode_steps, **kwargs)
         try:
@@ -72,14 +72,14 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
 
 
 class GymnasiumEnv:
-    """A Gymnasium environment as a `HostEnv`. All values that it returns are checked, but not that they are finite."""
+    """A Gymnasium environment as a `HostEnv`. Its values are checked, but they may be infinite or NaN (`check_finite`)."""
 
     def __init__(self, task: TaskSpec, **kwargs: Any):
         """Make the environment of a task. See `gymnasium.make` for the keyword arguments.
 
         Raises `LareError` if it cannot be made, or has no time limit.
         """
-        self._name, self._task = task.environment, task
+        self._label, self._task = f"environment {task.environment!r}", task
         self.environment = make_gymnasium(task.environment, task.max_episode_steps, **kwargs)
         if not (self.environment.spec and self.environment.spec.max_episode_steps):
             self.close()
@@ -88,8 +88,7 @@ class GymnasiumEnv:
         assert isinstance(action_space, Discrete | Box)
         self._agent = Agent("agent", self.environment.observation_space, action_space, observes_mask=False)
         if isinstance(action_space, Box):
-            dtype = np.result_type(action_space.dtype, np.float32)  # bounds stay as precise as they are
-            fields: dict[str, Any] = {key: getattr(action_space, key)[None].astype(dtype) for key in ("low", "high")}
+            fields: dict[str, Any] = {"low": action_space.low[None], "high": action_space.high[None]}
         else:
             fields = {"first_choice": int(action_space.start)}
         self.spec = EnvSpec(
@@ -102,17 +101,20 @@ class GymnasiumEnv:
             entry_meanings=entry_meanings(task.observation),
             **fields,
         )
-        self._decodes = action_space.dtype not in (np.float32, np.float64)  # these are passed on as they are
+        self._decodes = action_space.dtype not in (
+            np.float32,
+            np.float64,
+        )  # actions of these types are within the bounds
         self._state, self._alive = np.zeros(0, np.float32), np.ones(1, bool)
         self._available = np.ones((1, self.spec.action_size), bool)
 
     def reset(self, seed: int) -> Timestep:
-        with one_line_errors(f"environment {self._name!r} failed in reset"):
+        with one_line_errors(f"{self._label} failed in reset"):
             observation, info = self.environment.reset(seed=seed)
         return self._make_timestep(observation, 0.0, False, False, info)
 
     def step(self, action: Float[np.ndarray, "1 action"]) -> Timestep:
-        with one_line_errors(f"environment {self._name!r} failed in step"):
+        with one_line_errors(f"{self._label} failed in step"):
             env_action = self._agent.decode_action(action[0]) if self._decodes else action[0]
             observation, reward, terminated, truncated, info = self.environment.step(env_action)
             terminated, truncated = bool(terminated), bool(truncated)  # fails for arrays with several elements
@@ -120,29 +122,24 @@ class GymnasiumEnv:
 
     def _make_timestep(self, observation: Any, reward: Any, terminated: bool, truncated: bool, info: Any) -> Timestep:
         if not isinstance(info, dict):
-            raise LareError(f"environment {self._name!r} returned info {short_repr(info)}, which is not a dictionary")
-        name = "observation"
-        try:
-            observation = self._agent.flatten_observation(observation)
-            name = "reward"
-            reward = float_array(to_float(reward))
-        except ValueError as error:
-            raise EnvOutputError(f"environment {self._name!r}: the {name} {error}") from None
+            raise LareError(f"{self._label} returned info {short_repr(info)}, which is not a dictionary")
+        vector = convert_output(self._agent.flatten_observation, observation, f"{self._label}: the observation")
+        number = convert_output(to_float, reward, f"{self._label}: the reward")
         last = terminated or truncated
         return Timestep(
-            observation=observation[None],
+            observation=vector[None],
             state=self._state,
             available=self._available,
             alive=self._alive,
-            reward=reward[None],
+            reward=float_array([number]),
             terminated=np.bool_(terminated),
             truncated=np.bool_(truncated),
             measures=read_measures([info], self._task, last=last),
         )
 
     def render(self) -> Any:
-        with one_line_errors(f"environment {self._name!r} failed in render"):
+        with one_line_errors(f"{self._label} failed in render"):
             return self.environment.render()
 
     def close(self) -> None:
-        close_env(self.environment, f"environment {self._name!r}")
+        close_env(self.environment, self._label)

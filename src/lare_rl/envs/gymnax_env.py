@@ -1,4 +1,4 @@
-"""Environments of gymnax: `gymnax/CartPole-v1`. The adapter calls `step_env`, which does not reset."""
+"""Environments of gymnax, such as `gymnax/CartPole-v1`. The adapter calls `step_env`, which does not reset."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,18 +7,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from lare_rl.envs.jax_spaces import AgentEnv, action_fields, construct, draw_updates, import_package
+from lare_rl.envs.jax_packages import AgentEnv, action_fields, construct, draw_updates, import_package
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["make"]
 
-LIMIT = "max_steps_in_episode"
+TIME_LIMIT = "max_steps_in_episode"
 """The time limit's name among the parameters of an environment."""
 
 
 def make(task: TaskSpec, **_: Any) -> AgentEnv:
-    """Make the environment of a task with the name `gymnax/ID`. An observation that is a number of a state becomes one-hot.
+    """Make the environment of a task with the name `gymnax/ID`. Discrete observations become one-hot.
 
     The task's arguments are arguments of `gymnax.make` or parameters of the environment. Raises `LareError` if it cannot be made.
     """
@@ -29,16 +29,16 @@ def make(task: TaskSpec, **_: Any) -> AgentEnv:
     arguments = {key: value for key, value in task.arguments.items() if key not in changes}
     env, params = construct(task, names, gymnax.make, arguments)
     if task.max_episode_steps:
-        changes[LIMIT] = task.max_episode_steps
+        changes[TIME_LIMIT] = task.max_episode_steps
     params = params.replace(**changes)
-    actions, n_states = env.action_space(params), getattr(env.observation_space(params), "n", None)
+    action_space, n_states = env.action_space(params), getattr(env.observation_space(params), "n", None)
 
     def observe(observation: Any) -> Any:
         return observation if n_states is None else jax.nn.one_hot(observation, n_states)
 
     def reset(key: Array) -> tuple[Any, dict[str, Any]]:
         observation, state = env.reset_env(key, params)
-        *_, info = jax.eval_shape(env.step_env, key, state, actions.sample(key), params)
+        *_, info = jax.eval_shape(env.step_env, key, state, action_space.sample(key), params)
         measures = jax.tree.map(lambda value: jnp.zeros(value.shape), info)
         return state, {"observation": observe(observation), "measures": measures}
 
@@ -61,5 +61,5 @@ def make(task: TaskSpec, **_: Any) -> AgentEnv:
             raise LareError(f"environment {task.environment!r} cannot be drawn: gymnax has no pictures of it")
         return draw_updates(visualizer, len(states))
 
-    fields = action_fields(actions, task.environment)
-    return AgentEnv(task, env, reset, step, draw, max_steps=int(getattr(params, LIMIT)), **fields)
+    action_spec = action_fields(action_space, task.environment)
+    return AgentEnv(task, env, reset, step, draw, max_steps=int(getattr(params, TIME_LIMIT)), **action_spec)

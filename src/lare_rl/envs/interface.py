@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Real, UInt8
 
 __all__ = [
     "AnyArray",
@@ -66,8 +66,8 @@ class EnvSpec:
     """The maximum length of an episode."""
     state_size: int = 0
     """The size of the global state; 0 for an environment without a state."""
-    low: Float[np.ndarray, "agents action"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    high: Float[np.ndarray, "agents action"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    low: Real[np.ndarray, "agents action"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    high: Real[np.ndarray, "agents action"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     """The bounds of continuous actions, in the environment's units. Empty for discrete actions."""
     fixed_length: bool = False
     """Whether all episodes have `max_steps` steps and no agent leaves before the end."""
@@ -82,13 +82,18 @@ class EnvSpec:
     first_choice: int = 0
     """The number that the environment's package gives to the first discrete action."""
     choice_sizes: tuple[int, ...] = ()
-    """The sizes of several choices at a time, if their combinations are the discrete actions."""
+    """The number of values of each component of a `MultiDiscrete` action. The discrete actions are all their combinations."""
     package_shape: tuple[int, ...] | None = None
-    """The shape of an action for the environment's package. By default, discrete actions are numbers, others rows of numbers."""
+    """The shape of an action for the environment's package. By default, discrete actions are numbers, continuous ones vectors."""
     agent_names: tuple[str, ...] = field(default=(), compare=False)
     """The environment's names of the agents, for messages."""
     entry_meanings: Mapping[int, str] = field(default_factory=dict, compare=False)
-    """What entries of an observation mean, for messages."""
+    """The meanings of entries of an observation, by index, for messages."""
+
+    def __post_init__(self) -> None:
+        for name in ("low", "high"):  # bounds may be integers, but the actions between them are not
+            bounds = getattr(self, name)
+            object.__setattr__(self, name, bounds.astype(np.result_type(bounds.dtype, np.float32)))
 
     @property
     def n_agents(self) -> int:
@@ -97,7 +102,11 @@ class EnvSpec:
     @property
     def action_dtype(self) -> np.dtype:
         """The type of actions in the environment's units."""
-        return np.dtype(np.float32) if self.discrete else self.low.dtype
+        return self.low.dtype
+
+    def find_team(self, name: str | None) -> Team:
+        """Return the team of this name, or the first team if there is none."""
+        return next((team for team in self.teams if team.name == name), self.teams[0])
 
     def agent_label(self, index: int) -> str:
         """Return the name of an agent, for messages."""
@@ -122,65 +131,6 @@ class Timestep(NamedTuple):
     """Whether the episode has reached its time limit."""
     measures: dict[str, Float[AnyArray, "*batch"]]
     """Values by the names of `EnvSpec.measures`. They are valid only at the last step of an episode."""
-
-
-def team_mean(
-    values: Float[AnyArray, "*batch agents"], alive: Bool[AnyArray, "*batch agents"], team: Team
-) -> Float[AnyArray, "*batch"]:
-    """Return the mean over a team's agents that are alive, or 0 without such agents.
-
-    This mean of rewards is the reward of a team for a step. The team's return R is the sum of these rewards over the episode.
-    """
-    return alive_mean(values[..., team.agents], alive[..., team.agents])
-
-
-def alive_mean(
-    values: Float[AnyArray, "*batch agents"], alive: Bool[AnyArray, "*batch agents"]
-) -> Float[AnyArray, "*batch"]:
-    """Return the mean over the agents that are alive, or 0 without such agents. Values of other agents may be NaN."""
-    xp = _array_module(values)
-    return xp.where(alive, values, 0).sum(axis=-1) / xp.maximum(alive.sum(axis=-1), 1)
-
-
-def to_env_action(
-    action: Float[AnyArray, "*batch agents action"], spec: EnvSpec
-) -> Float[AnyArray, "*batch agents action"]:
-    """Clip a continuous action to [-1, 1] and scale it to the environment's units. Encode a discrete action by its argmax."""
-    xp = _array_module(action)
-    if spec.discrete:
-        return (np.arange(spec.action_size) == xp.argmax(action, axis=-1)[..., None]).astype(np.float32)
-    clipped = xp.minimum(xp.maximum(action, -1), 1)  # np.clip takes ten times as long for small arrays
-    scaled = spec.low + (clipped + 1) / 2 * (spec.high - spec.low)
-    return xp.minimum(xp.maximum(scaled, spec.low), spec.high)  # rounding may exceed the bounds
-
-
-def to_package_action(action: Float[AnyArray, "*batch action"], spec: EnvSpec) -> Any:
-    """Return actions of a single agent, in the environment's units, as the environment's package takes them in its own `step`.
-
-    A one-hot row becomes the number of its choice, or an array of numbers where there are several choices at a time.
-    """
-    if not spec.discrete:
-        return action if spec.package_shape is None else action.reshape(*action.shape[:-1], *spec.package_shape)
-    xp = _array_module(action)
-    number = xp.argmax(action, axis=-1)
-    if not spec.choice_sizes:
-        return number + spec.first_choice
-    numbers = xp.stack(xp.unravel_index(number, spec.choice_sizes), axis=-1)
-    return numbers.reshape(*number.shape, *(spec.package_shape or (-1,)))
-
-
-def with_available_action(mask: Bool[AnyArray, "*batch actions"]) -> Bool[AnyArray, "*batch actions"]:
-    """Return masks in which the first action is available if no other is."""
-    first = np.arange(mask.shape[-1]) == 0
-    return mask | (first & ~mask.any(axis=-1, keepdims=True))
-
-
-def _array_module(array: AnyArray) -> Any:
-    if isinstance(array, np.ndarray):
-        return np
-    import jax.numpy
-
-    return jax.numpy
 
 
 State = TypeVar("State")
@@ -225,3 +175,54 @@ class HostEnv(Protocol):
 
     def close(self) -> None:
         """Release the resources of the environment."""
+
+
+def team_mean(
+    values: Float[AnyArray, "*batch agents"], alive: Bool[AnyArray, "*batch agents"], team: Team
+) -> Float[AnyArray, "*batch"]:
+    """Return the mean over a team's agents that are alive, or 0 without such agents.
+
+    This mean of rewards is the reward of a team for a step. The team's return R is the sum of these rewards over the episode.
+    """
+    return alive_mean(values[..., team.agents], alive[..., team.agents])
+
+
+def alive_mean(
+    values: Float[AnyArray, "*batch agents"], alive: Bool[AnyArray, "*batch agents"]
+) -> Float[AnyArray, "*batch"]:
+    """Return the mean over the agents that are alive, or 0 without such agents. Values of other agents may be NaN."""
+    xp = values.__array_namespace__()
+    return xp.where(alive, values, 0).sum(axis=-1) / xp.maximum(alive.sum(axis=-1), 1)
+
+
+def to_env_action(
+    action: Float[AnyArray, "*batch agents action"], spec: EnvSpec
+) -> Float[AnyArray, "*batch agents action"]:
+    """Clip a continuous action to [-1, 1] and scale it to the environment's units. Encode the argmax of a discrete action one-hot."""
+    xp = action.__array_namespace__()
+    if spec.discrete:
+        return (np.arange(spec.action_size) == xp.argmax(action, axis=-1)[..., None]).astype(np.float32)
+    clipped = xp.minimum(xp.maximum(action, -1), 1)  # np.clip takes ten times as long for small arrays
+    scaled = spec.low + (clipped + 1) / 2 * (spec.high - spec.low)
+    return xp.minimum(xp.maximum(scaled, spec.low), spec.high)  # rounding may exceed the bounds
+
+
+def to_package_action(action: Float[AnyArray, "*batch action"], spec: EnvSpec) -> Any:
+    """Return actions of a single agent, in the environment's units, as the environment's package takes them in its own `step`.
+
+    A one-hot vector becomes the number of its action, or the numbers of all components of a `MultiDiscrete` action.
+    """
+    if not spec.discrete:
+        return action if spec.package_shape is None else action.reshape(*action.shape[:-1], *spec.package_shape)
+    xp = action.__array_namespace__()
+    number = xp.argmax(action, axis=-1)
+    if not spec.choice_sizes:
+        return number + spec.first_choice
+    numbers = xp.stack(xp.unravel_index(number, spec.choice_sizes), axis=-1)
+    return numbers.reshape(*number.shape, *(spec.package_shape or (-1,)))
+
+
+def with_available_action(mask: Bool[AnyArray, "*batch actions"]) -> Bool[AnyArray, "*batch actions"]:
+    """Return masks in which the first action is available where no action was."""
+    first = np.arange(mask.shape[-1]) == 0
+    return mask | (first & ~mask.any(axis=-1, keepdims=True))

@@ -1,4 +1,4 @@
-"""A `JaxEnv` that steps on the host, to verify a function or to inspect the environment."""
+"""A `JaxEnv` that steps on the host, to verify a latent function or to inspect the environment."""
 
 from typing import Any
 

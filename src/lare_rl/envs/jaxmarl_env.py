@@ -1,4 +1,4 @@
-"""Environments of JaxMARL: `jaxmarl/MPE_simple_spread_v3`. The adapter calls `step_env`, which does not reset."""
+"""Environments of JaxMARL, such as `jaxmarl/MPE_simple_spread_v3`. The adapter calls `step_env`, which does not reset."""
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lare_rl.envs import jax_spaces
+from lare_rl.envs import jax_packages
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
 from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
 from lare_rl.envs.interface import Timestep, with_available_action
@@ -20,14 +20,14 @@ from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["JaxMARLEnv", "JaxMARLState", "make"]
 
-LIMITS = ("max_steps", "episode_length")
+TIME_LIMITS = ("max_steps", "episode_length")
 """JaxMARL's names of the time limit, as arguments and attributes."""
 ALL = "__all__"
 """JaxMARL's key for the end of the episode."""
 WORLD_STATE = "world_state"
 """JaxMARL's key for the global state among the observations."""
-RESETS_ITSELF = ("coin_game",)
-"""Environments whose steps put the next game's first observation in place of the last one."""
+SELF_RESETTING = ("coin_game",)
+"""Environments whose last step returns the first observation of the next game."""
 
 
 def make(task: TaskSpec, **_: Any) -> "JaxMARLEnv":
@@ -36,19 +36,19 @@ def make(task: TaskSpec, **_: Any) -> "JaxMARLEnv":
     The task's arguments are arguments of `jaxmarl.make`. If the environment has a time limit, `max_episode_steps` sets it. Raises
     `LareError` if it cannot be made, or has no time limit.
     """
-    jaxmarl = jax_spaces.import_package("jaxmarl", task)
+    jaxmarl = jax_packages.import_package("jaxmarl", task)
     names = jaxmarl.registered_envs
-    if task.name_in_family in RESETS_ITSELF:
-        raise jax_spaces.unusable(task.environment, "its steps hide the last observation of a game")
-    env = jax_spaces.construct(task, names, jaxmarl.make)
-    limit_name = next((name for name in LIMITS if getattr(env, name, None)), None)
+    if task.name_in_family in SELF_RESETTING:
+        raise jax_packages.unusable(task.environment, "its steps hide the last observation of a game")
+    env = jax_packages.construct(task, names, jaxmarl.make)
+    limit_name = next((name for name in TIME_LIMITS if getattr(env, name, None)), None)
     changes: dict[str, Any] = {}
     if limit_name and task.max_episode_steps:
         changes[limit_name] = task.max_episode_steps
-    if getattr(env, "auto_reset", False):  # multi-agent Brax resets inside its steps, unless it is told not to
+    if getattr(env, "auto_reset", False):  # by default, multi-agent Brax resets inside its steps
         changes["auto_reset"] = False
     if changes:
-        env = jax_spaces.construct(task, names, jaxmarl.make, changes | task.arguments)
+        env = jax_packages.construct(task, names, jaxmarl.make, changes | task.arguments)
     limit = task.max_episode_steps or (getattr(env, limit_name) if limit_name else None)
     if limit is None:
         raise no_time_limit_error(task)
@@ -66,9 +66,9 @@ class JaxMARLState(NamedTuple):
 class JaxMARLEnv:
     """An environment of JaxMARL as a `JaxEnv`.
 
-    Agents are in the order of their teams, and their spaces are padded as in `AgentArrays`. JaxMARL does not tell a time limit from
-    another end: an episode that ends at `max_steps` is truncated, one that ends before is terminated. At the last step no agent
-    leaves, because `phi` may read the observations of the agents that acted.
+    Agents are in the order of their teams, and their spaces are padded as in `AgentArrays`. JaxMARL does not distinguish truncation:
+    an episode that ends at `max_steps` is truncated, an episode that ends earlier is terminated. At the last step no agent leaves,
+    because `phi` may read the observations of the agents that acted.
     """
 
     def __init__(self, env: Any, task: TaskSpec, max_steps: int):
@@ -77,8 +77,8 @@ class JaxMARLEnv:
         with one_line_errors(f"environment {self._name!r} cannot be used"):
             observations, state = jax.eval_shape(env.reset, jnp.zeros(2, jnp.uint32))
             if not (isinstance(observations, Mapping) and set(names) <= set(observations)):
-                raise jax_spaces.unusable(self._name, "its observations are not a dictionary by agent")
-            agents = [_make_agent(x, env.action_space(x), jax_spaces.flat_size(observations[x])) for x in names]
+                raise jax_packages.unusable(self._name, "its observations are not a dictionary by agent")
+            agents = [_make_agent(x, env.action_space(x), jax_packages.flat_size(observations[x])) for x in names]
             self.layout = AgentArrays(agents)
             self._masks = _find_masks(env, state) if self.layout.discrete else None
             actions = {agent.name: jnp.asarray(agent.action_space.sample()) for agent in agents}
@@ -90,13 +90,13 @@ class JaxMARLEnv:
             state_size=jax.eval_shape(self._read_state, observations, state).shape[0],
             masks_actions=self._masks is not None or not self.layout.available.all(),
             is_jax=True,
-            measures=jax_spaces.find_measures(task, infos),
+            measures=jax_packages.find_measures(task, infos),
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[JaxMARLState, Timestep]:
-        observations, env_state = self.env.reset(jax_spaces.raw_key(key))
+        observations, env_state = self.env.reset(jax_packages.raw_key(key))
         alive = jnp.ones(self.spec.n_agents, bool)
-        state = JaxMARLState(jax_spaces.strong_types(env_state), jnp.zeros((), jnp.int32), alive)
+        state = JaxMARLState(jax_packages.cast_like(env_state, env_state), jnp.zeros((), jnp.int32), alive)
         return state, self._make_timestep(observations, state, jnp.zeros(self.spec.n_agents), jnp.zeros((), bool), {})
 
     def step(
@@ -104,13 +104,15 @@ class JaxMARLEnv:
     ) -> tuple[JaxMARLState, Timestep]:
         agents = self.layout.agents
         actions = {agent.name: _decode(agent, action[index]) for index, agent in enumerate(agents)}
-        observations, env_state, rewards, dones, infos = self.env.step_env(jax_spaces.raw_key(key), state.env, actions)
+        observations, env_state, rewards, dones, infos = self.env.step_env(
+            jax_packages.raw_key(key), state.env, actions
+        )
         reward = jnp.stack([jnp.asarray(rewards[agent.name], jnp.float32).reshape(()) for agent in agents])
         done = jnp.stack([jnp.asarray(dones[agent.name], bool).reshape(()) for agent in agents])
         ended = jnp.asarray(dones[ALL], bool).reshape(())
         alive = state.alive & (ended | ~done)
         ended |= ~alive.any()
-        next_state = JaxMARLState(jax_spaces.cast_like(env_state, state.env), state.steps + 1, alive)
+        next_state = JaxMARLState(jax_packages.cast_like(env_state, state.env), state.steps + 1, alive)
         return next_state, self._make_timestep(observations, next_state, reward * state.alive, ended, infos)
 
     def _make_timestep(
@@ -130,22 +132,22 @@ class JaxMARLEnv:
             reward=reward,
             terminated=ended & ~at_limit,
             truncated=at_limit,
-            measures=jax_spaces.read_measures(self.spec, infos),
+            measures=jax_packages.read_measures(self.spec, infos),
         )
 
     def _pad(self, observations: Mapping[Any, Any]) -> Float[Array, "agents observation"]:
-        """Return all observations in one array: padded, and with the agent's index if the agents' spaces differ."""
+        """Return all observations in one array, padded, with the agents' indices if `AgentArrays` adds them."""
         layout = self.layout
-        vectors = [jax_spaces.flatten_tree(observations[agent.name]) for agent in layout.agents]
+        vectors = [jax_packages.flatten_tree(observations[agent.name]) for agent in layout.agents]
         padded = jnp.stack([jnp.pad(vector, (0, layout.longest_observation - len(vector))) for vector in vectors])
         return jnp.concatenate([padded, jnp.eye(len(vectors))], axis=1) if layout.adds_index else padded
 
     def _read_state(self, observations: Mapping[Any, Any], state: Any) -> Float[Array, " state"]:
-        """Return the global state. Without one, return all observations if credit is assigned from the state."""
+        """Return the global state. If there is none: all observations if credit is assigned from the state, else nothing."""
         if WORLD_STATE in observations:
-            return jax_spaces.flatten_tree(observations[WORLD_STATE])
+            return jax_packages.flatten_tree(observations[WORLD_STATE])
         if hasattr(self.env, "get_world_state"):
-            return jax_spaces.flatten_tree(self.env.get_world_state(state))
+            return jax_packages.flatten_tree(self.env.get_world_state(state))
         return self._pad(observations).ravel() if self._from_observations else jnp.zeros(0)
 
     def _read_masks(self, state: JaxMARLState) -> Bool[Array, "agents action"]:
@@ -159,8 +161,8 @@ class JaxMARLEnv:
         return with_available_action(available & state.alive[:, None])
 
     def frames(self, states: Any, credit: Any = None) -> list[np.ndarray]:
-        """Return the package's pictures of states, which do not show credit. Raise `LareError` if it cannot draw them here."""
-        return jax_spaces.draw_states(self._name, self._draw, states)
+        """Return the package's pictures, which do not show credit. Raises `LareError` if it cannot draw them here."""
+        return jax_packages.draw_states(self._name, self._draw, states)
 
     def _draw(self, states: Sequence[Any]) -> Sequence[Any]:
         """Draw the states of a particle task."""
@@ -168,22 +170,22 @@ class JaxMARLEnv:
             raise LareError(f"environment {self._name!r} cannot be drawn: only JaxMARL's particle tasks (MPE_...) can")
         from jaxmarl.environments.mpe.mpe_visualizer import MPEVisualizer
 
-        return jax_spaces.draw_updates(MPEVisualizer(self.env, [state.env for state in states]), len(states))
+        return jax_packages.draw_updates(MPEVisualizer(self.env, [state.env for state in states]), len(states))
 
 
 def _make_agent(name: Any, space: Any, observation_size: int) -> Agent:
-    """Make an agent from JaxMARL's action space and the size of its observations, which its spaces may state wrongly."""
+    """Make an agent from its action space and the true size of its observations, because JaxMARL's observation space may be wrong."""
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (observation_size,), np.float32)
     if hasattr(space, "n"):
         return make_agent(name, observation_space, gymnasium.spaces.Discrete(int(space.n)))
     if hasattr(space, "low"):
         low, high = (np.broadcast_to(np.asarray(bound, np.float32), space.shape) for bound in (space.low, space.high))
         return make_agent(name, observation_space, gymnasium.spaces.Box(low, high, dtype=np.float32))
-    raise LareError(f"the actions of {name} are {short_repr(space)}: {jax_spaces.TRAINABLE_ACTIONS}")
+    raise LareError(f"the actions of {name} are {short_repr(space)}: {jax_packages.TRAINABLE_ACTIONS}")
 
 
 def _decode(agent: Agent, action: Float[Array, " action"]) -> Array:
-    """Return the environment's action of a padded vector."""
+    """Return the action that a padded vector encodes: `Agent.decode_action` in JAX, for JaxMARL's spaces."""
     action = action[: agent.action_size]
     if agent.discrete:
         return jnp.argmax(action).astype(jnp.int32)

@@ -1,4 +1,4 @@
-"""Environments of Jumanji: `jumanji/Snake-v1`. Jumanji resets only in wrappers, which the adapter does not use."""
+"""Environments of Jumanji, such as `jumanji/Snake-v1`. Jumanji resets only in wrappers, which the adapter does not use."""
 
 import inspect
 from collections.abc import Sequence
@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from lare_rl.envs.env_errors import no_time_limit_error
-from lare_rl.envs.jax_spaces import AgentEnv, action_fields, construct, import_package, mask_combinations, unusable
+from lare_rl.envs.jax_packages import AgentEnv, action_fields, construct, import_package, mask_combinations, unusable
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["make", "observed_arrays"]
 
 MASK = "action_mask"
 """Jumanji's name of the mask of available actions in an observation."""
-LIMIT = "time_limit"
+TIME_LIMIT = "time_limit"
 """Jumanji's name of the time limit, as an argument and an attribute."""
 
 
@@ -34,32 +34,31 @@ def make(task: TaskSpec, **_: Any) -> AgentEnv:
     The task's arguments are arguments of `jumanji.make`. If the environment has a time limit, `max_episode_steps` sets it. Raises
     `LareError` if it cannot be made, or has several agents or no time limit.
 
-    The observation is all arrays of Jumanji's observation but the mask, in the order of its fields, each row by row. Several choices
-    at a time are one choice of all their combinations. An episode that ends with a discount of 0 is terminated, as Jumanji says;
-    else it is truncated.
+    An observation has all arrays of Jumanji's except the mask, in their order, each row by row. The combinations of a multi-discrete
+    action are discrete actions. An episode whose last discount is 0 is terminated, any other is truncated.
     """
     jumanji = import_package("jumanji", task)
     names = sorted(jumanji.registered_environments())
     env = construct(task, names, jumanji.make)
-    if task.max_episode_steps and LIMIT in inspect.signature(type(env).__init__).parameters:
-        env = construct(task, names, jumanji.make, {LIMIT: task.max_episode_steps} | task.arguments)
-    max_steps = task.max_episode_steps or getattr(env, LIMIT, None)
+    if task.max_episode_steps and TIME_LIMIT in inspect.signature(type(env).__init__).parameters:
+        env = construct(task, names, jumanji.make, {TIME_LIMIT: task.max_episode_steps} | task.arguments)
+    max_steps = task.max_episode_steps or getattr(env, TIME_LIMIT, None)
     if max_steps is None:
         raise no_time_limit_error(task)
-    action = action_fields(env.action_spec, task.environment)
+    action_spec = action_fields(env.action_spec, task.environment)
 
     def read(timestep: Any, steps: Any) -> dict[str, Any]:
         if timestep.reward.shape:
             agents = f"each of its {len(timestep.reward)} agents has rewards"
             raise unusable(task.environment, f"{agents}, and LaRe's adapter of Jumanji has one agent")
         is_terminal = timestep.last() & (timestep.discount == 0)
-        mask = _find_mask(timestep.observation) if action["discrete"] else None
+        mask = _find_mask(timestep.observation) if action_spec["discrete"] else None
         return {
             "observation": [array for _, array in observed_arrays(timestep.observation)],
             "reward": timestep.reward,
             "terminated": is_terminal,
             "truncated": (timestep.last() & ~is_terminal) | (steps >= max_steps),
-            "available": None if mask is None else mask_combinations(mask, action["choice_sizes"]),
+            "available": None if mask is None else mask_combinations(mask, action_spec["choice_sizes"]),
             "measures": timestep.extras,
         }
 
@@ -80,11 +79,11 @@ def make(task: TaskSpec, **_: Any) -> AgentEnv:
         finally:
             viewer.close()
 
-    return AgentEnv(task, env, reset, step, draw, max_steps=max_steps, **action)
+    return AgentEnv(task, env, reset, step, draw, max_steps=max_steps, **action_spec)
 
 
 def observed_arrays(observation: Any) -> list[tuple[str, Any]]:
-    """Return the names and arrays of an observation, without the mask, in the order in which they are flattened."""
+    """Return the names and arrays of an observation except the mask, in the order in which they are flattened."""
     leaves = jax.tree_util.tree_leaves_with_path(observation)
     return [(jax.tree_util.keystr(path, simple=True, separator="."), x) for path, x in leaves if not _is_mask(path)]
 

@@ -22,10 +22,9 @@ def shipped_tasks() -> list[str]:
 
 
 def resolve_task(task: TaskSpec | str | Path, playable: bool = True) -> TaskSpec:
-    """Return the task of a spec, a shipped name, or the path of a file.
+    """Return a spec unchanged, or read the task of a shipped name or path. Raises `LareError` like `load_task`.
 
-    If `playable`, the environment of a name or path must exist and match the task. A spec is returned as it is. Raises `LareError`
-    like `load_task`, and for anything else.
+    If `playable`, the environment of a name or path must exist and match the task.
     """
     if isinstance(task, TaskSpec):
         return task
@@ -76,48 +75,42 @@ def check_environment(spec: TaskSpec) -> None:
 
 
 def _read_values(task: str, ancestors: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return the keys of a task file. The task named by `like` provides missing keys, and `teams` become their values."""
+    """Return the keys of a task file, with those of the task that `like` names, and with the keys of each team's file in `teams`."""
     try:
         values = rename_keys(read_toml(_read_file(task)))
     except ValueError as error:  # TOMLDecodeError, or a number with too many digits
         raise LareError(f"task {task!r} is not valid TOML: {error}") from error
-    like, teams, paths = values.get("like"), values.get("teams"), (*ancestors, os.path.realpath(task))
+    like, teams, paths = values.pop("like", None), values.get("teams"), (*ancestors, os.path.realpath(task))
 
     def is_valid(name: Any) -> bool:
-        return isinstance(name, str) and os.path.realpath(resolve_path(task, name)) not in paths
+        return isinstance(name, str) and "\0" not in name and os.path.realpath(resolve_path(task, name)) not in paths
 
     if not (like is None or is_valid(like)):
         raise LareError(f"task {task!r}: like = {like!r} must be another task, without a cycle")
     if not (teams is None or (isinstance(teams, list) and all(map(is_valid, teams)))):
         raise LareError(f"task {task!r}: teams = {teams!r} must be a list of other tasks, without a cycle")
+    if like is not None:
+        values = _read_values(resolve_path(task, like), paths) | values
     if teams is not None:
         shared = {key: values[key] for key in SHARED_KEYS if key in values}
         values["teams"] = [shared | _read_values(resolve_path(task, team), paths) for team in teams]
-    values.pop("like", None)
-    return values if like is None else _read_values(resolve_path(task, like), paths) | values
+    return values
 
 
 def _read_file(task: str) -> str:
     if task in shipped_tasks():
         return (SHIPPED / f"{task}.toml").read_text(encoding="utf-8")
-    if _is_file(task):
+    if os.path.isfile(task):
         return read_text(Path(task), MAX_SETTINGS_BYTES)
     if task.endswith(".toml"):
         raise LareError(f"there is no task file {task}")
-    if task and os.path.isdir(task):
+    if os.path.isdir(task):
         raise LareError(f"{task} is a folder. Name a task file (.toml) or a shipped task (lare-rl tasks lists them).")
     hint = did_you_mean(task, shipped_tasks())
     raise LareError(f"no task {task!r}{hint}. Name a task file, or a shipped task: {', '.join(shipped_tasks())}.")
 
 
 def resolve_path(task: str, name: str) -> str:
-    """Return the path or name of a task that a file names. A path is relative to the folder of this file."""
+    """Return the path or shipped name of a task that is called `name` in the file of `task`. A path is relative to its folder."""
     path = str(Path(task).parent / name)
-    return path if task not in shipped_tasks() and (name.endswith(".toml") or _is_file(path)) else name
-
-
-def _is_file(name: str) -> bool:
-    try:
-        return Path(name).is_file()
-    except (OSError, ValueError):  # too long, or with a character that no file name has
-        return False
+    return path if task not in shipped_tasks() and (name.endswith(".toml") or os.path.isfile(path)) else name

@@ -1,7 +1,7 @@
 """Gymnasium's MuJoCo environments with other rewards than their descriptions suggest.
 
-The language model reads the description of the original task, so the recorded replies of the original task are used. Dynamics,
-episode starts and ends are those of the original task.
+Dynamics, starts and ends of episodes are those of the original task. The language model reads the description of the original task,
+so its recorded replies are those for the original task.
 
 Hidden rewards, for HalfCheetah-v4 (v0 = 2 m/s) and Walker2d-v4 (v0 = 1 m/s). v is the forward velocity after the step (entry 8 of
 the observation), theta the angle of the front or left foot (entry 7), and a the action:
@@ -25,9 +25,9 @@ from gymnasium.utils import RecordConstructorArgs
 __all__ = ["HIDDEN_REWARDS", "TARGET_SPEEDS", "HiddenReward", "SparseDistanceReward", "register"]
 
 FOOT_ANGLE, VELOCITY = 7, 8
-"""The indices of both entries in the observation."""
+"""The indices of these entries of the observation."""
 TARGET_SPEEDS = {"HalfCheetah": 2.0, "Walker2d": 1.0}
-"""v0 (m/s)."""
+"""v0 (m/s), by body."""
 
 HIDDEN_REWARDS: dict[str, Callable[[np.ndarray, float, float], float]] = {
     "Target": lambda next_obs, effort, v0: np.exp(-((next_obs[VELOCITY] - v0) ** 2)) - 0.02 * effort,

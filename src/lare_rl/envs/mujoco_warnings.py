@@ -1,8 +1,7 @@
-"""MuJoCo's warnings about the models of environments.
+"""MuJoCo's warnings about the models of environments, which it prints and appends to MUJOCO_LOG.TXT in the working directory.
 
-MuJoCo prints a warning, and appends it to a file MUJOCO_LOG.TXT in the working directory. Later versions warn so whenever a
-half cheetah is made: its model, a file of Gymnasium, Brax or Playground, uses an attribute that MuJoCo will remove. A user cannot
-change that.
+MuJoCo 4 warns whenever a half cheetah is made: its model, a file of Gymnasium, Brax or Playground, uses a deprecated attribute, which
+a user cannot change.
 """
 
 import contextlib
@@ -16,7 +15,7 @@ __all__ = ["mujoco_warnings"]
 
 @contextlib.contextmanager
 def mujoco_warnings(name: str) -> Iterator[None]:
-    """Make an environment in this block. MuJoCo's warnings become warnings of Python, except those of deprecated attributes."""
+    """Turn MuJoCo's warnings in a block that makes an environment into Python's, and drop those about deprecated attributes."""
     mujoco: Any = sys.modules.get("mujoco")  # its type stubs lack these functions
     if mujoco is None:
         yield

@@ -50,7 +50,7 @@ def make_parallel_env(name: str, arguments: Mapping[str, Any]) -> Any:
 
 
 def _check_maker(maker: Any, name: str) -> None:
-    """Raise `LareError` for a function that a module has only imported, such as one that runs commands: a file may name it."""
+    """Raise `LareError` for a maker that its module only imports: a task file could name `os.system` so."""
     module, maker_name = split_environment(name)
     package = (getattr(maker, "__module__", module) or "").partition(".")[0]
     trusted = {other.partition(".")[0] for other in (module, "pettingzoo", *trusted_modules())}
@@ -61,7 +61,7 @@ def _check_maker(maker: Any, name: str) -> None:
 
 
 def find_time_limit(env: Any, arguments: Mapping[str, Any]) -> int | None:
-    """Return an environment's own time limit (steps), if the environment or its arguments contain one."""
+    """Return the time limit (steps) among an environment's arguments or attributes, or None."""
     unwrapped = getattr(env, "unwrapped", env)
     candidates = [arguments.get(name) for name in TIME_LIMITS]
     for owner in (env, unwrapped, getattr(unwrapped, "env", None)):
@@ -75,7 +75,7 @@ def agent_kind(name: Any) -> str:
 
 
 def group_by_team(names: Sequence[Any], task: TaskSpec) -> tuple[list[Any], tuple[Team, ...]]:
-    """Return the agents' names, team by team, and the teams.
+    """Return the agents' names, team after team, and the teams.
 
     Raises `LareError` if an agent is in no team or in several, or if a team has no agents.
     """
@@ -85,7 +85,7 @@ def group_by_team(names: Sequence[Any], task: TaskSpec) -> tuple[list[Any], tupl
         if not members:
             agents = ", ".join(map(str, names))
             raise LareError(f"task {task.name!r}: no agent is in {team}. The agents are {agents} ({patterns}).")
-    if task.team is not None:  # the task file of a single team, used to verify its function
+    if task.team is not None:  # the file of a single team, whose function is verified
         rest = [name for name in names if name not in teams[task.team]]
         return _make_teams(teams | ({f"not {task.team}": rest} if rest else {}))
     for name in names:

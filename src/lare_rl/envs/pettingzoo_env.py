@@ -1,6 +1,6 @@
 """A PettingZoo environment as a `HostEnv`: `pettingzoo/MODULE:NAME`, where NAME makes a ParallelEnv.
 
-Agents and spaces are checked once. The values of each step are checked, but not that they are finite (`check_finite`).
+Agents and spaces are checked once, values at each step. They may be infinite or NaN (`check_finite`).
 """
 
 import logging
@@ -15,6 +15,7 @@ from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
 from lare_rl.envs.env_errors import (
     EnvOutputError,
     close_env,
+    convert_output,
     no_time_limit_error,
     one_line_errors,
     read_measures,
@@ -43,8 +44,8 @@ def make(task: TaskSpec, render_mode: str | None = None) -> "ParallelHost":
 class ParallelHost:
     """A ParallelEnv as a `HostEnv`. Each agent has a fixed index, no matter which agents act.
 
-    If an agent leaves while others stay, it observes zeros from then on. At an episode's last step no agent leaves: those that
-    acted still observe the result, because `phi` may read it.
+    An agent that leaves while others stay observes zeros from then on. At an episode's last step no agent leaves: those that acted
+    observe the result, because `phi` may read it.
     """
 
     def __init__(self, environment: Any, task: TaskSpec):
@@ -52,10 +53,10 @@ class ParallelHost:
 
         Raises `LareError` if the agents, spaces or first observations cannot be used, or if there is no time limit.
         """
-        self.environment, self._task, self._name = environment, task, task.environment
+        self.environment, self._task, self._label = environment, task, f"environment {task.environment!r}"
         names = list(environment.possible_agents or ())
         if not names or len(set(names)) != len(names):
-            raise LareError(f"environment {self._name!r} has possible agents {short_repr(names)}. Each needs a name.")
+            raise LareError(f"{self._label} has possible agents {short_repr(names)}. Each needs a name.")
         names, teams = group_by_team(names, task)
         try:
             with one_line_errors("its spaces cannot be read"):
@@ -63,7 +64,7 @@ class ParallelHost:
             agents = [make_agent(name, *pair) for name, pair in zip(names, spaces, strict=True)]
             self.layout = AgentArrays(agents)
         except LareError as error:
-            raise LareError(f"environment {self._name!r}: {error}") from None
+            raise LareError(f"{self._label}: {error}") from None
         max_steps = task.max_episode_steps or find_time_limit(environment, task.arguments)
         if max_steps is None:
             raise no_time_limit_error(task)
@@ -91,7 +92,7 @@ class ParallelHost:
         observations, infos = self._call("reset", 2, seed=int(seed))
         self._steps = 0
         self._present = self._read_present()
-        self._left = np.zeros_like(self._alive)
+        self._departed = np.zeros_like(self._alive)
         if not self._present.any():
             raise self._error(" has no agents after reset")
         self._alive = self._present.copy()
@@ -100,57 +101,57 @@ class ParallelHost:
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
         acted = self._alive
         if not acted.any():
-            raise LareError(f"environment {self._name!r} has no running episode. Call reset before step.")
+            raise LareError(f"{self._label} has no running episode. Call reset before step.")
         agents = self.layout.agents
         actions = {agents[index].name: agents[index].decode_action(action[index]) for index in np.flatnonzero(acted)}
         observations, rewards, terminations, truncations, infos = self._call("step", 5, actions)
         self._steps += 1
         was_present, self._present = self._present, self._read_present()
-        self._left |= was_present & ~self._present
-        for index in np.flatnonzero(self._present & ~was_present & self._left):
-            raise self._error(f": {agents[index].name} is among its agents again after it left")
+        self._departed |= was_present & ~self._present
+        if (returned := self._present & ~was_present & self._departed).any():
+            raise self._error(f": {agents[np.argmax(returned)].name} is among its agents again after it left")
 
         reward = np.zeros(len(agents))
         terminated, truncated = np.zeros((2, len(agents)), bool)
         for index, agent in enumerate(agents):
-            required = bool(acted[index] and self._present[index])  # values of an agent that has left may be missing
+            required = bool(acted[index] and self._present[index])  # an agent that has left may have no values
             if acted[index]:
                 reward[index] = self._read("reward", rewards, agent, to_float, required)
             terminated[index] = self._read("termination", terminations, agent, to_float, required)
             truncated[index] = self._read("truncation", truncations, agent, to_float, required)
-        self._left |= self._present & (terminated | truncated)  # some environments still list such agents
+        self._departed |= self._present & (terminated | truncated)  # some environments still list such agents
 
-        alive = self._present & ~self._left
+        alive = self._present & ~self._departed
         ended = not alive.any()
         was_truncated = ended and bool((acted & truncated & ~terminated).any())
         observes = alive
         if ended:
             observes = acted & [agent.name in observations for agent in agents] & ~(was_truncated & terminated)
         reached_limit = not ended and self._steps >= self.spec.max_steps
-        self._alive = alive & (not reached_limit)
+        self._alive = alive & (not reached_limit)  # after the last step, `step` refuses to go on
         return self._make_timestep(
             observations, infos, reward, observes, alive, ended and not was_truncated, was_truncated or reached_limit
         )
 
-    def render(self) -> Float[np.ndarray, "height width 3"] | Any:
-        with one_line_errors(f"environment {self._name!r} failed in render"):
+    def render(self) -> np.ndarray:
+        with one_line_errors(f"{self._label} failed in render"):
             pixels = self.environment.render()
         if not isinstance(pixels, np.ndarray) or pixels.ndim != 3 or pixels.shape[2] != 3:
             raise LareError(
-                f"environment {self._name!r} renders {short_repr(pixels)}, not pixels (height, width, 3). "
+                f"{self._label} renders {short_repr(pixels)}, not pixels (height, width, 3). "
                 "It must support the render mode 'rgb_array'."
             )
         return pixels
 
     def close(self) -> None:
-        close_env(self.environment, f"environment {self._name!r}")
+        close_env(self.environment, self._label)
 
     def _error(self, predicate: str) -> EnvOutputError:
-        return EnvOutputError(f"environment {self._name!r}{predicate}")
+        return EnvOutputError(f"{self._label}{predicate}")
 
     def _call(self, method: str, n: int, *args: Any, **kwargs: Any) -> tuple[Mapping[Any, Any], ...]:
         """Return the n dictionaries by agent that `reset` or `step` of the environment returns."""
-        with one_line_errors(f"environment {self._name!r} failed in {method}"):
+        with one_line_errors(f"{self._label} failed in {method}"):
             values = getattr(self.environment, method)(*args, **kwargs)
         if not (isinstance(values, tuple) and len(values) == n and all(isinstance(value, Mapping) for value in values)):
             raise self._error(f" returned {short_repr(values)} from {method}, not {n} dictionaries by agent")
@@ -158,7 +159,7 @@ class ParallelHost:
 
     def _read_present(self) -> Bool[np.ndarray, " agents"]:
         index = self.layout.index
-        with one_line_errors(f"environment {self._name!r}: its agents cannot be read"):
+        with one_line_errors(f"{self._label}: its agents cannot be read"):
             names = list(self.environment.agents)
         for name in names:
             if name not in index:
@@ -169,17 +170,14 @@ class ParallelHost:
     def _read(
         self, name: str, values: Mapping[Any, Any], agent: Agent, convert: Callable[[Any], Any], required: bool
     ) -> Any:
-        """Return an agent's value, converted; 0 if it is missing and not required."""
+        """Return an agent's value, converted, or 0 if it is missing and not required."""
         try:
             value = values[agent.name]  # not `in`: PettingZoo's own wrapper returns rewards as a defaultdict
         except KeyError:
             if required:
                 raise self._error(f" returned no {name} for {agent.name}") from None
             return 0
-        try:
-            return convert(value)
-        except ValueError as error:
-            raise self._error(f": the {name} of {agent.name} {error}") from None
+        return convert_output(convert, value, f"{self._label}: the {name} of {agent.name}")
 
     def _make_timestep(
         self,
@@ -191,7 +189,7 @@ class ParallelHost:
         terminated: bool = False,
         truncated: bool = False,
     ) -> Timestep:
-        """Make a timestep. `observes`: agents that observe it. `acts`: agents that can continue, whose masks are read."""
+        """Make a timestep. `observes` marks the agents that observe it, `acts` those that act next, whose masks are read."""
         vectors: dict[int, np.ndarray] = {}
         available = self._available.copy()
         for index, agent in enumerate(self.layout.agents):
@@ -200,13 +198,14 @@ class ParallelHost:
                 if acts[index]:
                     read_mask = partial(agent.read_mask, info=infos.get(agent.name))
                     mask = self._read("action mask", observations, agent, read_mask, True)
-                    if mask is not None:
-                        available[index, : agent.action_size] = mask
-                        self._masks_actions |= self._initialising
-                    if mask is not None and not self._masks_actions:
+                    if mask is None:
+                        continue
+                    self._masks_actions |= self._initialising
+                    if not self._masks_actions:
                         raise self._error(
                             f" returned an action mask for {agent.name}, but none at its first reset. Return masks at every step."
                         )
+                    available[index, : agent.action_size] = mask
             elif self.layout.discrete:
                 available[index] = np.arange(self.layout.action_size) == 0
         observation = self.layout.pad_observations(vectors)
@@ -223,7 +222,7 @@ class ParallelHost:
         )
 
     def _read_state(self, observation: Float[np.ndarray, "agents observation"]) -> Float[np.ndarray, " state"]:
-        """Return the environment's state. Without one: all observations if credit is assigned from the state, else nothing."""
+        """Return the environment's state. If it has none: all observations if credit is assigned from the state, else nothing."""
         if self._initialising or self._state is not None:
             self._update_state()
         if self._state is not None:
@@ -234,7 +233,7 @@ class ParallelHost:
         if not callable(getattr(self.environment, "state", None)):
             return
         try:
-            with one_line_errors(f"environment {self._name!r} failed in state"):
+            with one_line_errors(f"{self._label} failed in state"):
                 value = self.environment.state()
         except LareError as error:
             if self._initialising and isinstance(error.__cause__, NotImplementedError):
@@ -246,7 +245,5 @@ class ParallelHost:
                 logging.getLogger(__name__).warning("%s; the previous state is used instead", error)
             self._state_failed = True
             return
-        try:
-            self._state = float_array(value, None if self._state is None else self._state.shape)
-        except ValueError as error:
-            raise self._error(f": the state {error}") from None
+        read_array = partial(float_array, shape=None if self._state is None else self._state.shape)
+        self._state = convert_output(read_array, value, f"{self._label}: the state")

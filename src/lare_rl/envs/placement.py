@@ -1,8 +1,8 @@
-"""Which process an environment runs in: this one, or one of its own, which is watched and kept for the next use.
+"""The process in which an environment runs: this one, or its own, which is watched and waits for the next environment of the task.
 
-Many simulators allow a single simulation in a process (libsumo is one), and a run needs two environments at least: for training
-and for evaluations. The key `processes` of a task says so. If it is "auto", the first two environments of a package that LaRe
-does not know are tried in a worker process.
+Some simulators, such as libsumo, allow a single simulation in a process, and a run needs two environments at least: for training
+and for evaluations. A task says so by `processes = "separate"`. With "auto", two environments of a package that LaRe does not know
+are tried in a worker process.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from lare_rl.envs.env_errors import close_env
 from lare_rl.envs.families import GYMNASIUM, find_family, make_env, make_local_env, picklable_maker
 from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
 from lare_rl.envs.trials import time_steps
-from lare_rl.envs.vec_env import LocalVecEnv, VecEnv, select_row
+from lare_rl.envs.vec_env import LocalVecEnv, VecEnv, first_timestep
 from lare_rl.envs.workers import SubprocVecEnv
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec, split_environment
@@ -38,27 +38,26 @@ __all__ = [
 ]
 
 SLOW_STEP_S = 2e-3
-"""An environment of an unknown package gets a process of its own if a step takes longer. A call of a worker takes a tenth of this."""
+"""If a step of an unknown package's environment takes longer, each gets its own process. A call of a worker takes a tenth of this."""
 SLOW_START_S = 2.0
-"""An environment that takes longer than this to make gets a process of its own as well. Making a second one to find out would take as
-long again."""
+"""If an unknown package's environment takes longer to make, each gets its own process: a trial of a second would take as long again."""
 SECOND_TIMEOUT_S = 30.0
-"""If a second environment hangs for so long beside a first one that started fast, each needs a process of its own."""
+"""If a second environment in the process does not reply for longer, each gets its own process."""
 
 MIN_SAVED_S = 3e-4
-"""Workers are used if they make a step of all environments at least this much faster. A call of all workers costs about as much."""
+"""Workers are used if they save more than this in a step of all environments. A call of all workers takes about as long."""
 
 _log = logging.getLogger(__name__)
 
 _FAMILIAR_PACKAGES = {"gymnasium", "gymnasium_robotics", "lare_rl", "mpe2", "pettingzoo", "minigrid", "ale_py"}
-"""Packages whose environments do not disturb each other. Environments of others are tried."""
+"""Packages whose environments can share a process. Environments of others are tried."""
 
 _separate_tasks: dict[str, bool] = {}
-"""Whether the environments of a task run in processes of their own, by the task's JSON, as far as it has been tried."""
+"""Whether each environment of a task needs its own process, by the JSON of the tasks that have been tried."""
 
 
 class SeparateEnv:
-    """A `HostEnv` in a worker process. `close` keeps the process for the next environment of the same task.
+    """A `HostEnv` in a worker process, which waits for the next environment of the same task after `close`.
 
     Raises `LareError` if the environment cannot be made, dies, or does not reply within the task's `timeout`.
     """
@@ -68,10 +67,10 @@ class SeparateEnv:
         self.spec = self.envs.spec
 
     def reset(self, seed: int) -> Timestep:
-        return select_row(self.envs.reset(np.ones(1, bool), np.array([seed])))
+        return first_timestep(self.envs.reset(np.ones(1, bool), np.array([seed])))
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
-        return select_row(self.envs.step(action[None]))
+        return first_timestep(self.envs.step(action[None]))
 
     def render(self) -> NoReturn:
         raise LareError("an environment in a process of its own cannot be drawn")
@@ -83,13 +82,13 @@ class SeparateEnv:
 def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
     """Make a task's environment as a `HostEnv`, even if it is a `JaxEnv`. See `make_env`.
 
-    If it needs a process of its own, as far as this is known, it gets one, except with `kwargs`, because a worker draws no films.
+    It is in its own process if `runs_separately`, but not with `kwargs`, because a worker draws no films.
     """
     return SeparateEnv(task) if runs_separately(task) and not kwargs else make_local_env(task, **kwargs)
 
 
 def load_env_spec(task: TaskSpec) -> EnvSpec:
-    """Return the sizes and bounds of a task's environment. It is made once to read them. Raises `LareError` like `make_env`."""
+    """Return the specification of a task's environment, which is made once for this. Raises `LareError` like `make_env`."""
     return _load_env_spec(task.model_dump_json())
 
 
@@ -97,16 +96,16 @@ def load_env_spec(task: TaskSpec) -> EnvSpec:
 def _load_env_spec(task_json: str) -> EnvSpec:
     task = TaskSpec.model_validate_json(task_json)
     env = make_host_env(task) if task.processes == "separate" else make_env(task)
-    if isinstance(env, HostEnv):
+    if not env.spec.is_jax:
         close_env(env, f"environment {task.environment!r}")
     return env.spec
 
 
 def make_vec_env(task: TaskSpec, n: int, parallel: bool = False) -> VecEnv:
-    """Make `n` environments of a task: each in a process of its own if it needs that, else where they step fastest.
+    """Make `n` environments of a task: each in its own process if it needs that, else where they step fastest.
 
-    An environment that cannot be made in another process, such as one that the user's script registers, stays in this process.
-    If `parallel`, all are in worker processes in any case.
+    Environments that workers cannot make, such as those that the user's script registers, stay in this process. If `parallel`, all
+    are in worker processes in any case.
     """
     if needs_process(task):
         return _make_separate(task, n)
@@ -121,17 +120,17 @@ def make_vec_env(task: TaskSpec, n: int, parallel: bool = False) -> VecEnv:
 
 
 def n_open_envs(task: TaskSpec, n_seeds: int, n_episodes: int) -> int:
-    """Return how many environments of each seed play the episodes of an evaluation at the same time."""
+    """Return the number of environments of each seed that play the episodes of an evaluation at the same time."""
     return min(n_episodes, max(1, n_usable_cores() // n_seeds)) if needs_process(task) else n_episodes
 
 
 def runs_separately(task: TaskSpec) -> bool:
-    """Return whether a task's environments need processes of their own, as far as this is known without trying."""
+    """Return whether each environment of a task needs its own process, by its file or an earlier trial."""
     return task.processes == "separate" or _separate_tasks.get(task.model_dump_json(), False)
 
 
 def needs_process(task: TaskSpec) -> bool:
-    """Return whether each environment of a task needs a process of its own. It is found out at most once in this process."""
+    """Return whether each environment of a task needs its own process. Environments are tried at most once."""
     if task.processes == "separate":
         return True
     key = task.model_dump_json()
@@ -142,10 +141,10 @@ def needs_process(task: TaskSpec) -> bool:
 
 
 def _try_second(task: TaskSpec) -> bool:
-    """Return whether environments are slow, or disturb each other in one process. Try them in a worker process."""
+    """Try environments in a worker process. Return whether they are slow, or cannot share a process."""
     try:
         env = SeparateEnv(task)
-    except LareError:  # another process cannot make it, because the user's script registers it
+    except LareError:  # a worker cannot make it, because the user's script registers it
         return False
     try:
         step_s = env.envs.measure_step_s()
@@ -161,8 +160,8 @@ def _try_second(task: TaskSpec) -> bool:
 
 
 def measure_step_s(task: TaskSpec) -> float:
-    """Return the time that a step of a task's environment takes (s). It is measured once in this process."""
-    needs_process(task)  # this decides in which process it is made
+    """Return the time (s) of a step of a task's environment. It is measured once."""
+    needs_process(task)  # decides where `make_host_env` makes it
     return _measure_task(task.model_dump_json())
 
 

@@ -1,4 +1,4 @@
-"""Plays episodes of a task from the view of one of its roles, to verify and examine latent functions before training."""
+"""Plays episodes of a task, and returns them from the view of one of its roles, to verify and examine latent functions."""
 
 import contextlib
 import itertools
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from lare_rl.envs.env_errors import name_step
 from lare_rl.envs.interface import EnvSpec, HostEnv, Team, Timestep, team_mean, to_env_action
 from lare_rl.envs.placement import make_host_env
-from lare_rl.envs.vec_env import LocalVecEnv, select_row
+from lare_rl.envs.vec_env import LocalVecEnv, first_timestep
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import CreditScope, TaskSpec
 
@@ -20,7 +20,6 @@ __all__ = [
     "Episode",
     "EpisodeListener",
     "Policy",
-    "find_team",
     "make_episode",
     "phi_inputs",
     "play_episodes",
@@ -32,7 +31,7 @@ __all__ = [
 
 @runtime_checkable
 class StatefulPolicy(Protocol):
-    """A policy that may have a memory (`evaluation.policy.RunPolicy`)."""
+    """A policy that may have a memory, such as `evaluation.policy.RunPolicy`."""
 
     def reset(self) -> None:
         """Begin a new episode."""
@@ -44,8 +43,8 @@ class StatefulPolicy(Protocol):
 
 
 Policy = Callable[..., np.ndarray] | StatefulPolicy
-"""A function from the observation of a single agent to its action, in the environment's units, or an object with one. If actions may
-be unavailable, its second argument is the mask of available actions."""
+"""The policy of a single agent, as an object or as its function `select_env_action` alone. The second argument, the mask of available
+actions, is passed only if actions may be unavailable."""
 
 EpisodeListener = Callable[[int], None]
 """A function that is called with the number of episodes after each of them."""
@@ -53,7 +52,7 @@ EpisodeListener = Callable[[int], None]
 
 @dataclass(frozen=True)
 class Episode:
-    """A complete episode. A step has one row for each agent of the team, or one row if credit is assigned from the state."""
+    """A complete episode. A step has a row for each agent of the team, or a single row if credit is assigned from the state."""
 
     observation: Float[np.ndarray, "steps rows observation"]
     env_action: Float[np.ndarray, "steps rows action"]
@@ -66,17 +65,12 @@ class Episode:
     measures: Mapping[str, float] = field(default_factory=dict)
     """The task's measures, from the last step."""
     group: str | int | float | None = None
-    """The group of the episode, if the task or the log has groups."""
+    """The group of the episode, if there are groups."""
 
     @property
     def return_(self) -> float:
         """The return R of the team."""
         return float(sum(self.team_reward))
-
-
-def find_team(role: TaskSpec, spec: EnvSpec) -> Team:
-    """Return the team that a role names, or the first team."""
-    return next((team for team in spec.teams if team.name == role.team), spec.teams[0])
 
 
 def phi_inputs(credit_scope: CreditScope, team: Team, timestep: Timestep, env_action: Any) -> tuple[Any, Any]:
@@ -125,8 +119,8 @@ def make_episode(
     next_timestep: Timestep,
     measures: Mapping[str, float] | None = None,
 ) -> Episode:
-    """Return the rows of a role, from all steps of an episode."""
-    team, scope = find_team(role, spec), role.credit_scope
+    """Return an episode from the view of a role: `timestep` is before each step, `next_timestep` after it."""
+    team, scope = spec.find_team(role.team), role.credit_scope
     observation, action = phi_inputs(scope, team, timestep, env_action)
     next_observation, _ = phi_inputs(scope, team, next_timestep, env_action)
     team_reward = np.asarray(team_mean(next_timestep.reward, timestep.alive, team))
@@ -146,18 +140,18 @@ def _stack(timesteps: Sequence[Timestep]) -> Timestep:
 def play_steps(
     env: HostEnv, policy: Policy | None, rng: np.random.Generator, seed: int
 ) -> Iterator[tuple[Timestep, np.ndarray, Timestep]]:
-    """Play one episode. Yield the timestep before each step, the action, and the timestep after it."""
+    """Play an episode. Yield the timestep before each step, the action in the environment's units, and the timestep after it."""
     if isinstance(policy, StatefulPolicy):
         policy.reset()
         policy = policy.select_env_action
     envs = LocalVecEnv([lambda: env])  # it checks every timestep
     with name_step(0):
-        next_timestep = select_row(envs.reset(np.ones(1, bool), np.array([seed])))
+        next_timestep = first_timestep(envs.reset(np.ones(1, bool), np.array([seed])))
     for number in itertools.count(1):
         timestep = next_timestep
         action = sample_action(env.spec, timestep, rng) if policy is None else _act(policy, env.spec, timestep)
         with name_step(number):
-            next_timestep = select_row(envs.step(action[None]))
+            next_timestep = first_timestep(envs.step(action[None]))
         yield timestep, action, next_timestep
         if next_timestep.terminated or next_timestep.truncated:
             return

@@ -1,6 +1,6 @@
-"""Environments of Brax, `brax/halfcheetah`, and of MuJoCo Playground, `playground/CheetahRun`.
+"""Environments of Brax, such as `brax/halfcheetah`, and of MuJoCo Playground, such as `playground/CheetahRun`.
 
-Both packages have the functions `reset(rng)` and `step(state, action)`. Playground's simulator is MuJoCo's own, written for JAX (MJX).
+Both packages have the functions `reset(rng)` and `step(state, action)`. Playground simulates with MJX, which is MuJoCo for JAX.
 """
 
 import math
@@ -12,19 +12,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from lare_rl.envs import jax_spaces
-from lare_rl.envs.jax_spaces import AgentEnv
+from lare_rl.envs import jax_packages
+from lare_rl.envs.jax_packages import AgentEnv
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["adapt_robot", "make_brax", "make_playground"]
 
 BRAX_MAX_STEPS = 1000
-"""The default of `brax.envs.create`."""
+"""The default of `episode_length` in `brax.envs.create`."""
 PICTURE_SIZE = {"height": 240, "width": 320}
-"""Pixels of a picture of Playground."""
+"""Pixels of Playground's pictures."""
 
 OBSERVATION, PRIVILEGED = "state", "privileged_state"
-"""Keys of an observation that is a dictionary: what the policy observes, and what only a critic may."""
+"""Keys of an observation that is a dictionary: what the policy observes, and what only a critic may observe."""
 
 
 def make_brax(task: TaskSpec, **_: Any) -> AgentEnv:
@@ -32,8 +32,8 @@ def make_brax(task: TaskSpec, **_: Any) -> AgentEnv:
 
     The task's arguments are arguments of the environment's class, such as `backend`. Raises `LareError` if it cannot be made.
     """
-    envs = jax_spaces.import_package("brax.envs", task)
-    env = jax_spaces.construct(task, envs._envs, envs.get_environment)
+    envs = jax_packages.import_package("brax.envs", task)
+    env = jax_packages.construct(task, envs._envs, envs.get_environment)
 
     def draw(states: list[Any]) -> Any:
         from brax.io import image
@@ -49,26 +49,26 @@ def make_playground(task: TaskSpec, **_: Any) -> AgentEnv:
     The task's arguments replace values of the environment's configuration, such as `ctrl_dt` or `reward_config.scales.energy`.
     Raises `LareError` if it cannot be made.
     """
-    playground = jax_spaces.import_package("mujoco_playground", task)
+    playground = jax_packages.import_package("mujoco_playground", task)
 
     def load(name: str, **arguments: Any) -> tuple[Any, Any]:
         config = playground.registry.get_default_config(name)
         if "impl" in config:
             config.impl = _choose_implementation(task)
         env = playground.registry.load(name, config=config, config_overrides=arguments)
-        return env, config  # with the arguments, because the environment writes them into it
+        return env, config  # `load` has written the arguments into it
 
-    env, config = jax_spaces.construct(task, playground.registry.ALL_ENVS, load)
+    env, config = jax_packages.construct(task, playground.registry.ALL_ENVS, load)
     max_steps = math.ceil(config.episode_length / config.action_repeat)
     return adapt_robot(env, task, max_steps, partial(env.render, **PICTURE_SIZE), config.action_repeat)
 
 
 def _choose_implementation(task: TaskSpec) -> str:
-    """Return the faster implementation where it runs: Warp on a card of NVIDIA if it is installed, else the one in JAX.
+    """Return the name of Warp if it runs, which is faster and needs a card of NVIDIA, else that of the implementation in JAX.
 
-    Playground's own default is Warp everywhere. `GraphMode` is a number where the version of Warp does not fit that of MuJoCo.
+    Playground's default is Warp everywhere. `GraphMode` lacks its member if the version of Warp does not fit that of MuJoCo.
     """
-    io = jax_spaces.import_package("mujoco.mjx._src.io", task)
+    io = jax_packages.import_package("mujoco.mjx._src.io", task)
     return "warp" if io.has_cuda_gpu_device() and hasattr(io.mjxw.types.GraphMode, "WARP") else "jax"
 
 
@@ -87,8 +87,8 @@ def adapt_robot(
     """Adapt an environment of Brax or Playground.
 
     The packages count steps and reset in wrappers, which this adapter does not use. An episode is truncated after `max_steps` steps.
-    It terminates where the package says `done`, and where the simulator diverges: the last observation and the reward of a diverged
-    step are the previous observation and 0, because a value that is not finite would spoil all later updates. So are measures 0.
+    It terminates where the package says `done`, and where the simulator diverges. A step that diverges repeats the previous
+    observation, with reward 0, and measures that are not finite are 0, because NaN would spoil all later updates.
 
     Args:
         env: the package's environment, without wrappers.
@@ -99,14 +99,14 @@ def adapt_robot(
     max_steps = task.max_episode_steps or max_steps
 
     def observe(env_state: Any) -> tuple[Array, Array]:
-        """Return what the policy observes, and what only a critic may."""
+        """Return what the policy observes, and what only a critic may observe."""
         observation, privileged = env_state.obs, ()
         if isinstance(observation, Mapping):
             if OBSERVATION not in observation:
                 keys = ", ".join(observation)
-                raise jax_spaces.unusable(task.environment, f"it observes {keys}, but not {OBSERVATION!r}")
+                raise jax_packages.unusable(task.environment, f"it observes {keys}, but not {OBSERVATION!r}")
             observation, privileged = observation[OBSERVATION], observation.get(PRIVILEGED, ())
-        return jax_spaces.flatten_tree(observation), jax_spaces.flatten_tree(privileged)
+        return jax_packages.flatten_tree(observation), jax_packages.flatten_tree(privileged)
 
     def reset(key: Array) -> tuple[RobotState, dict[str, Any]]:
         env_state = env.reset(key)
@@ -139,10 +139,10 @@ def adapt_robot(
         return draw([state.env for state in states])
 
     # Playground's own algorithms act in [-1, 1] as well.
-    action = jax_spaces.bounded_action(-1.0, 1.0, (env.action_size,), task.environment)
-    return AgentEnv(task, env, reset, step, draw_robot, max_steps=max_steps, **action)
+    action_spec = jax_packages.bounded_action(-1.0, 1.0, (env.action_size,), task.environment)
+    return AgentEnv(task, env, reset, step, draw_robot, max_steps=max_steps, **action_spec)
 
 
 def _copy(state: Any) -> Any:
-    """Return a state with new dictionaries, because the packages' steps write into those of the state before."""
+    """Return a state with new dictionaries, because a step of the packages writes into those of its argument."""
     return jax.tree.map(lambda leaf: leaf, state)

@@ -19,7 +19,7 @@ __all__ = ["SharedArrays", "map_arrays", "map_current", "open_shared_memory"]
 
 
 class SharedArrays(NamedTuple):
-    """The arrays of all environments, which this process and the workers read and write."""
+    """The arrays of n environments, which this process and the workers read and write."""
 
     where: Bool[np.ndarray, " n"]
     seed: Int[np.ndarray, " n"]
@@ -33,9 +33,9 @@ class SharedArrays(NamedTuple):
 
 @contextlib.contextmanager
 def open_shared_memory() -> Iterator[str]:
-    """Yield the beginning of names of memory. What is mapped until the end lasts as long as a process has mapped it.
+    """Yield a prefix for the names of shared memory: a new directory of this user; on Windows, a unique name.
 
-    It is a new directory, which only this user may read; on Windows, a name that nothing else has.
+    Memory is mapped by its name until the block ends, and lasts as long as a process maps it.
     """
     if sys.platform == "win32":
         yield f"lare-{uuid4().hex}-"
@@ -46,7 +46,7 @@ def open_shared_memory() -> Iterator[str]:
 
 
 def _map(name: str, size: int) -> mmap.mmap:
-    """Map memory by its name. Raises `OSError` if there is no room: a mapped file without room would kill the process."""
+    """Map memory by its name. Raises `OSError` if there is no room: writing to a map without room would kill the process."""
     if sys.platform == "win32":
         return mmap.mmap(-1, size, tagname=name)
     with open(name, "a+b") as file:
@@ -57,13 +57,14 @@ def _map(name: str, size: int) -> mmap.mmap:
         return mmap.mmap(file.fileno(), size)
 
 
-def map_current(prefix: str, n_workers: int) -> Int[np.ndarray, " workers"]:
-    """Map a part of the memory with these names: the index of the environment that each worker calls now."""
-    return np.frombuffer(_map(prefix + "current", n_workers * np.dtype(np.int64).itemsize), np.int64)
+def map_current(prefix: str, worker_index: int, n_workers: int) -> Int[np.ndarray, "1"]:
+    """Map the index of the environment that a worker calls now."""
+    indices = np.frombuffer(_map(prefix + "current", n_workers * np.dtype(np.int64).itemsize), np.int64)
+    return indices[worker_index : worker_index + 1]
 
 
 def map_arrays(prefix: str, spec: EnvSpec, n: int) -> SharedArrays:
-    """Map the rest of the memory with these names: the arrays of `n` environments."""
+    """Map the arrays of `n` environments."""
     batch = empty_batch(spec, n)
     action = np.zeros((n, spec.n_agents, spec.action_size), spec.action_dtype)
     arrays = [np.zeros(n, bool), np.zeros(n, np.int64), action, *batch[:-1], *batch.measures.values()]

@@ -30,7 +30,7 @@ def check_spaces(owner: Any, observation: gymnasium.Space, action: gymnasium.Spa
 
 
 def flatten_value(space: gymnasium.Space, value: Any) -> Float[np.ndarray, " size"]:
-    """Return a value of a space as a new vector, in the order of `gymnasium.spaces.flatten`, which does not check values.
+    """Return a value of a space as a new vector, like `gymnasium.spaces.flatten`, which does not check values.
 
     Raises `ValueError` if the value is not in the space. The message is a predicate, such as "has the shape (3,), not (2,)".
     """
@@ -57,14 +57,14 @@ def _contains(space: gymnasium.Space, value: Any) -> bool:
 
 
 def _flatten_all(pairs: Iterable[tuple[gymnasium.Space, Any]]) -> Float[np.ndarray, " _"]:
-    """Return the values of some spaces, one behind the other."""
+    """Return the values of several spaces, one after the other, in one vector."""
     return np.concatenate([np.zeros(0, np.float32), *(flatten_value(space, value) for space, value in pairs)])
 
 
 def float_array(value: Any, shape: tuple[int, ...] | None = None) -> Float[np.ndarray, "..."]:
     """Return a value as a new float32 array.
 
-    Raises `ValueError`, whose message is a predicate, if it is not an array of numbers, or has another shape.
+    Raises `ValueError`, whose message is a predicate, if it is not an array of numbers or does not have this shape.
     """
     try:
         with np.errstate(over="ignore"):  # numbers beyond float32 become infinite, which `check_finite` refuses

@@ -23,11 +23,11 @@ from lare_rl.util.variables import read_variable
 __all__ = ["StarCraft", "make"]
 
 PACKAGES = {"smacv2.env": "smacv2.env", "smac.env.starcraft2": "smac.env"}
-"""For each package, a module that no other package has, and the module that contains the game."""
+"""The module with the game by a module that only the right package has: PyPI's `smac` has none of these."""
 DIFFICULTY = "7"
-"""The difficulty of the game's built-in opponent: "very hard", for which results are usually reported."""
+"""The difficulty "very hard" of the game's built-in opponent, for which results are usually reported."""
 MAX_CRASHES = 3
-"""A run fails after this number of crashes in a row, without a complete episode between them."""
+"""A run fails after this number of crashes without a complete episode between them."""
 NO_OP = 0
 """SMAC's only action for dead units. Living units do not have it."""
 
@@ -38,7 +38,7 @@ def make(task: TaskSpec, **_: Any) -> "StarCraft":
 
 
 class StarCraft:
-    """A map of SMAC as a `HostEnv`. The actions are SMAC's: no-op, stop, north, south, east, west, and to attack each enemy."""
+    """A map of SMAC as a `HostEnv`. The actions are SMAC's: no-op, stop, north, south, east, west, and one attack for each enemy."""
 
     def __init__(self, name: str, make_game: Callable[..., Any] | None = None):
         """Make the game of a map, by default with SMAC's class.
@@ -63,14 +63,14 @@ class StarCraft:
         )
 
     def _launch(self, seed: int) -> Any:
-        """Make a game with this seed. StarCraft II itself only starts with the first episode."""
+        """Make a game with this seed. StarCraft II itself starts with the first episode."""
         self.close()
         with one_line_errors(f"SMAC cannot make {self._name!r}"):
             self._game = self._make_game(map_name=self._name, difficulty=DIFFICULTY, seed=seed)
         return self._game
 
     def reset(self, seed: int) -> Timestep:
-        """Start an episode. Only the first one follows its seed: SMAC accepts a seed only at the start of a game, which is slow."""
+        """Start an episode. Only the first of a game follows its seed: SMAC takes a seed only for a new game, which starts slowly."""
         # Before an episode has ended, SMAC's reset would start another game in addition to the running one.
         if not self._can_continue:
             self._launch(seed)
@@ -80,7 +80,7 @@ class StarCraft:
         return self._make_timestep(np.zeros(self.spec.n_agents, np.float32), done=False, won=False)
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
-        """Make one step. If the game crashes, the episode is truncated, and the next `reset` starts the game again.
+        """Make one step. If the game crashes, the episode is truncated, and the next `reset` starts a new game.
 
         Raises `LareError` if SMAC refuses an action, or if the game has crashed too often.
         """
@@ -95,11 +95,11 @@ class StarCraft:
         return self._make_timestep(rewards, done=bool(done), won=bool(info.get("battle_won", False)))
 
     def _handle_crash(self) -> Timestep:
-        """Return the previous timestep with reward 0, truncated."""
+        """Return the previous timestep, truncated and with reward 0. Raises `LareError` after `MAX_CRASHES` crashes."""
         message = f"StarCraft II crashed in step {self._steps + 1} of an episode of {self._name}"
         self._can_continue, self._n_crashes = False, self._n_crashes + 1
         if self._n_crashes == MAX_CRASHES:
-            raise LareError(f"{message}, for the {MAX_CRASHES}rd time in a row")
+            raise LareError(f"{message}, {MAX_CRASHES} times in a row")
         warnings.warn(f"{message}: the episode ends there, and the game starts again", RuntimeWarning, stacklevel=3)
         return self._timestep._replace(reward=np.zeros_like(self._timestep.reward), truncated=np.array(True))
 
@@ -113,7 +113,7 @@ class StarCraft:
             available=available,
             alive=alive,
             reward=reward,
-            # SMAC does not distinguish truncation.
+            # SMAC says only that the episode is done: at the limit, it has terminated if a side has won.
             terminated=np.array(done and (not at_limit or won or not alive.any())),
             truncated=np.array(at_limit),
             measures={"won": np.array(won, np.float32)},
@@ -121,7 +121,8 @@ class StarCraft:
         return self._timestep
 
     def render(self) -> Any:
-        return self._game.render(mode="rgb_array")
+        with one_line_errors(f"StarCraft II cannot draw {self._name!r}"):
+            return self._game.render(mode="rgb_array")
 
     def close(self) -> None:
         if self._game is not None:
@@ -142,8 +143,7 @@ def _find_game() -> Callable[..., Any]:
         raise LareError(
             f"StarCraft II is not at {folder}. Set SC2PATH to its folder, with SMAC's maps in Maps/SMAC_Maps."
         )
-    # For example, old protocol buffers fail with a new protobuf.
-    with one_line_errors(f"{modules[0]} cannot be imported"):
+    with one_line_errors(f"{modules[0]} cannot be imported"):  # its old protocol buffers fail with a new protobuf
         return importlib.import_module(modules[0]).StarCraft2Env
 
 

@@ -1,7 +1,4 @@
-"""What a few steps say about an environment: how long they take, and whether a second environment in its process disturbs it.
-
-Some simulators allow a single simulation in a process.
-"""
+"""Measurements on the first steps of an environment: their time, and whether a second environment in the process disturbs it."""
 
 import contextlib
 import time
@@ -23,7 +20,7 @@ N_COMPARED_STEPS = 3
 
 @one_line_errors("the first steps of an episode failed")
 def time_steps(env: HostEnv) -> float:
-    """Return the time of the fastest of the first steps (s). The others may have been interrupted."""
+    """Return the shortest time of the first steps (s). Other programs may have slowed the others down."""
     timestep, times = env.reset(0), []
     while len(times) < N_TIMED_STEPS and not (timestep.terminated or timestep.truncated):
         action = fixed_action(env.spec, timestep)
@@ -34,7 +31,7 @@ def time_steps(env: HostEnv) -> float:
 
 
 def find_interference(env: HostEnv, maker: Maker) -> str | None:
-    """Make a second environment in this process, and step both by turns. Return what goes wrong, or None."""
+    """Make a second environment in this process, and step both in turns. Return what goes wrong, or None."""
     alone, again = (np.array([observation.copy() for observation in _play(env)]) for _ in range(2))
     observations = []
     try:
@@ -51,12 +48,12 @@ def find_interference(env: HostEnv, maker: Maker) -> str | None:
 
 
 def fixed_action(spec: EnvSpec, timestep: Timestep) -> Float[np.ndarray, "agents action"]:
-    """Return the first available discrete action, or the middle of continuous actions."""
+    """Return each agent's first available action, or the middle of its continuous actions."""
     return to_env_action(timestep.available.astype(np.float32), spec) if spec.discrete else (spec.low + spec.high) / 2
 
 
 def _play(env: HostEnv, seed: int = 0) -> Iterator[np.ndarray]:
-    """Yield the observations of the first steps of an episode, by the same action."""
+    """Yield the observations of the first steps of an episode, with the same action at each step."""
     timestep = env.reset(seed)
     yield timestep.observation
     for _ in range(N_COMPARED_STEPS):

@@ -1,7 +1,8 @@
-"""Many copies of a `HostEnv`, stepped in lockstep. `LocalVecEnv` has them in this process, `workers.SubprocVecEnv` in others."""
+"""Several `HostEnv`s, stepped in lockstep: in this process (`LocalVecEnv`) or in others (`workers.SubprocVecEnv`)."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,8 @@ __all__ = [
     "check_lengths",
     "check_same_sizes",
     "empty_batch",
+    "first_timestep",
     "make_env_at",
-    "select_row",
 ]
 
 Maker = Callable[[], HostEnv]
@@ -30,26 +31,25 @@ Maker = Callable[[], HostEnv]
 class VecEnv(ABC):
     """n environments with the same sizes. In training, n is the number of seeds times the environments of a seed, seeds first.
 
-    `where` selects environments: the rows of the others do not change. The next call overwrites the returned arrays. Environments whose
-    episode has ended are not reset: the caller does it.
+    The mask `where` selects environments: the rows of the others do not change. The next call overwrites the returned arrays. The
+    caller resets environments whose episode has ended.
     """
 
     stop_requested: Callable[[], bool] = staticmethod(lambda: False)
-    """Whether the user wants to stop. Environments in other processes must then reply soon; `LocalVecEnv` ignores it."""
+    """Whether the user wants to stop. Environments in other processes must then reply soon."""
 
     def __init__(self, spec: EnvSpec, batch: Timestep):
         self.spec = spec
         self.batch = batch
         """The last timestep of each environment."""
         self._length = np.zeros(len(batch.terminated), int)
-        """The steps of each environment's running episode."""
+        """The number of steps of each environment's running episode."""
 
     def reset(self, where: Bool[np.ndarray, " n"], seeds: Integer[np.ndarray, " n"]) -> Timestep:
         """Start an episode in the selected environments."""
         self._call("reset", seeds, where)
         self._length[where] = 0
-        self._check_lengths()
-        return self.batch
+        return self._check_lengths()
 
     def step(
         self, action: Float[np.ndarray, "n agents action"], where: Bool[np.ndarray, " n"] | None = None
@@ -58,11 +58,11 @@ class VecEnv(ABC):
         where = np.ones(len(action), bool) if where is None else where
         self._call("step", action, where)
         self._length[where] += 1
-        self._check_lengths()
-        return self.batch
+        return self._check_lengths()
 
-    def _check_lengths(self) -> None:
+    def _check_lengths(self) -> Timestep:
         check_lengths(self.spec, self._length, np.logical_or(self.batch.terminated, self.batch.truncated))
+        return self.batch
 
     @abstractmethod
     def _call(self, command: str, arguments: Shaped[np.ndarray, "n *rest"], where: Bool[np.ndarray, " n"]) -> None:
@@ -103,7 +103,7 @@ class LocalVecEnv(VecEnv):
 
 
 def make_env_at(env_index: int, maker: Maker) -> HostEnv:
-    """Make an environment. Its errors become one line with its index."""
+    """Make an environment. Raises `LareError` with its index if that fails."""
     with one_line_errors(f"environment {env_index} cannot be made"):
         return maker()
 
@@ -111,23 +111,21 @@ def make_env_at(env_index: int, maker: Maker) -> HostEnv:
 def check_lengths(spec: EnvSpec, length: Integer[np.ndarray, " n"], ended: Bool[np.ndarray, " n"]) -> None:
     """Raise `EnvOutputError` if an episode is longer or shorter than the specification says.
 
-    `length` is the number of steps that each episode has at present, and `ended` says whether it has ended.
+    `length` is the number of steps of each episode until now, and `ended` says whether it has ended.
     """
     at_limit = length >= spec.max_steps
     wrong = (at_limit != ended) if spec.fixed_length else (at_limit & ~ended)
     if wrong.any():
         index = int(np.argmax(wrong))
-        problem = f"the episode has {length[index]} steps and has not ended, but max_steps is {spec.max_steps}"
+        problem = f"has {length[index]} steps and has not ended, but max_steps is {spec.max_steps}"
         if ended[index]:
-            problem = (
-                f"the episode ended after {length[index]} steps, but fixed_length says that all have {spec.max_steps}"
-            )
-        raise EnvOutputError(f"the environment: {problem}", index)
+            problem = f"ended after {length[index]} steps, but fixed_length says that all have {spec.max_steps}"
+        raise EnvOutputError(f"the environment: the episode {problem}", index)
 
 
 def check_jax_env(env: JaxEnv, owner: str) -> None:
-    """Raise `EnvOutputError` if `reset` or `step` returns other arrays than the specification says, or lacks a measure."""
-    import jax  # not in worker processes
+    """Raise `EnvOutputError` if a timestep of `reset` or `step` does not match the specification."""
+    import jax  # worker processes import this module and do without JAX
 
     batch, key = empty_batch(env.spec, 1), jax.random.key(0)
     state, first = jax.eval_shape(env.reset, key)
@@ -160,7 +158,7 @@ def _check_shapes(timestep: Any, batch: Timestep, owner: str, function: str) -> 
 def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: Timestep) -> None:
     """Call "reset" or "step" of an environment, check its timestep, and write it into a row of the batch.
 
-    An `EnvOutputError` has the index as `env_index` alone: the caller's message names the environment.
+    An `EnvOutputError` has the index only as `env_index`: the caller names the environment in the message.
     """
     *columns, measures = batch
     owner = "the environment"
@@ -171,7 +169,9 @@ def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: T
             *values, new_measures = timestep
             for column, value in zip(columns, values, strict=True):
                 column[env_index] = value
-            row = Timestep(*(column[env_index] for column in columns), measures={})  # as float32, which may be infinite
+            row = Timestep(
+                *(column[env_index] for column in columns), measures={}
+            )  # numbers beyond float32 are infinite
             check_finite(row, env.spec, owner)
             for name, value in new_measures.items():
                 if name not in measures:
@@ -184,31 +184,28 @@ def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: T
 
 def check_same_sizes(specs: Sequence[EnvSpec]) -> None:
     """Raise `LareError` if environments have different sizes."""
-    first, *rest = map(_sizes, specs)
+    read_sizes = attrgetter("teams", "observation_size", "action_size", "discrete", "state_size", "measures")
+    first, *rest = map(read_sizes, specs)
     for env_index, sizes in enumerate(rest, 1):
         if sizes != first:
             raise LareError(f"environment {env_index} differs from environment 0: {sizes}, not {first}")
 
 
-def _sizes(spec: EnvSpec) -> tuple[Any, ...]:
-    return spec.teams, spec.observation_size, spec.action_size, spec.discrete, spec.state_size, spec.measures
-
-
-def empty_batch(spec: EnvSpec, *lead: int) -> Timestep:
-    """Return the timesteps of environments before their first reset, as arrays of shape `lead`."""
+def empty_batch(spec: EnvSpec, *batch_shape: int) -> Timestep:
+    """Return the timesteps of a batch of environments before their first reset."""
     return Timestep(
-        observation=np.zeros((*lead, spec.n_agents, spec.observation_size), np.float32),
-        state=np.zeros((*lead, spec.state_size), np.float32),
-        available=np.ones((*lead, spec.n_agents, spec.action_size), bool),
-        alive=np.zeros((*lead, spec.n_agents), bool),
-        reward=np.zeros((*lead, spec.n_agents), np.float32),
-        terminated=np.zeros(lead, bool),
-        truncated=np.zeros(lead, bool),
-        measures={name: np.zeros(lead, np.float32) for name in spec.measures},
+        observation=np.zeros((*batch_shape, spec.n_agents, spec.observation_size), np.float32),
+        state=np.zeros((*batch_shape, spec.state_size), np.float32),
+        available=np.ones((*batch_shape, spec.n_agents, spec.action_size), bool),
+        alive=np.zeros((*batch_shape, spec.n_agents), bool),
+        reward=np.zeros((*batch_shape, spec.n_agents), np.float32),
+        terminated=np.zeros(batch_shape, bool),
+        truncated=np.zeros(batch_shape, bool),
+        measures={name: np.zeros(batch_shape, np.float32) for name in spec.measures},
     )
 
 
-def select_row(batch: Timestep) -> Timestep:
+def first_timestep(batch: Timestep) -> Timestep:
     """Return a copy of the timestep of the first environment of a batch."""
     *columns, measures = batch
     return Timestep(*(column[0].copy() for column in columns), {name: value[0] for name, value in measures.items()})  # pyright: ignore[reportCallIssue]

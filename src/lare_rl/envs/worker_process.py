@@ -1,8 +1,8 @@
 """A worker process that steps environments: `Worker` is the parent's side, `_serve` is what runs in the process.
 
-Workers are new processes, never forks, because JAX runs threads in the parent. They are not started by `multiprocessing`, which
-would run the user's script again in each of them. The functions that make environments are pickled, so they must be importable.
-Actions and timesteps lie in shared memory, so that a step sends only a short message to a worker.
+Workers are new processes, never forks, because JAX runs threads in the parent. `multiprocessing` does not start them, because it
+would run the user's script again in each. The functions that make environments are pickled, so they must be importable. Actions and
+timesteps are in shared memory, so that a step sends only a short message to a worker.
 """
 
 import contextlib
@@ -19,7 +19,6 @@ from multiprocessing.connection import Client, Connection, Listener
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
 
 from lare_rl.envs.env_errors import EnvOutputError, close_env, one_line_errors
 from lare_rl.envs.interface import EnvSpec, HostEnv
@@ -35,7 +34,7 @@ PROGRAM = "import sys; from lare_rl.envs.worker_process import _serve; _serve(sy
 
 CONNECT_TIMEOUT_S = 120.0
 """A worker must listen within this time: it imports modules first."""
-POLL_S = 0.01
+CONNECT_POLL_S = 0.01
 CLOSE_TIMEOUT_S = 2.0
 """Workers must close their environments within this time."""
 
@@ -50,15 +49,15 @@ class Worker:
             self._address = rf"\\.\pipe\{self._address}"
         self.env_indices: Sequence[int] = ()
         self.specs: tuple[EnvSpec, ...] = ()
-        """The specifications of its environments, once they are made."""
+        """The specifications of its environments; empty until they are made."""
         self.make_s = 0.0
-        """How long it took to make them (s)."""
+        """The time in which they were made (s)."""
         self.is_busy = False
         """Whether a reply is pending."""
         self.last_active, self._last_index = time.monotonic(), 0
         self._current = np.zeros(1, np.int64)
         self.connection: Connection
-        """From `start_making` on."""
+        """Set by `start_making`."""
         self._is_connected = False
         # The same import paths as in this process, and one thread, so that other workers can use the other cores.
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
@@ -68,15 +67,15 @@ class Worker:
         )
 
     def start_making(self, makers: Mapping[int, Maker], memory: str, worker_index: int, n_workers: int) -> None:
-        """Number the environments anew, and use other memory. The makers of environments are ignored if they are made already."""
-        self.env_indices, self._current = list(makers), map_current(memory, n_workers)[worker_index : worker_index + 1]
+        """Make the environments if there are none. Number them by the keys of `makers`, and use this memory from now on."""
+        self.env_indices, self._current = list(makers), map_current(memory, worker_index, n_workers)
         self._current[0] = self.env_indices[0]
         self._connect()
         pickled = [] if self.specs else [pickle_maker(index, maker) for index, maker in makers.items()]
-        self.send("make", (worker_index, n_workers, self.env_indices, memory, pickled))
+        self.send("make", (memory, worker_index, n_workers, self.env_indices, pickled))
 
     def _connect(self) -> None:
-        """Connect to the process as soon as it listens, if that has not been done. Raises `LareError` if it ends or takes too long."""
+        """Connect to the process as soon as it listens, unless it is connected. Raises `LareError` if it ends or takes too long."""
         deadline = time.monotonic() + CONNECT_TIMEOUT_S
         while not self._is_connected:
             try:
@@ -86,15 +85,15 @@ class Worker:
                     raise self._make_death_error() from None
                 if time.monotonic() > deadline:
                     raise LareError(f"{self.label} did not start within {CONNECT_TIMEOUT_S:g} s") from None
-                time.sleep(POLL_S)
+                time.sleep(CONNECT_POLL_S)
 
     @property
     def label(self) -> str:
-        """The environment that should reply and the process, for error messages."""
+        """The environment that the worker calls, and the process, for messages."""
         return f"environment {self._current[0]} (in worker process {self.process.pid})"
 
     def measure_idle_s(self) -> float:
-        """Return for how long the worker has been seen at the same environment (s)."""
+        """Return the time (s) since the worker was first seen at its present environment."""
         if self._current[0] != self._last_index:
             self.last_active, self._last_index = time.monotonic(), int(self._current[0])
         return time.monotonic() - self.last_active
@@ -157,56 +156,73 @@ def pickle_maker(env_index: int, maker: Maker) -> bytes:
 
 
 def _serve(address: str) -> None:
-    """Run a worker: make, reset and step environments, with a reply to each command, until the connection closes."""
+    """Run a worker: reply to the parent's commands until it closes the connection."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     listener = Listener(address)
     connection = listener.accept()
     with contextlib.suppress(FileNotFoundError):  # the parent may have removed the socket already
         listener.close()
-    envs: dict[int, HostEnv] = {}
-    memory, current, shared = "", np.zeros(1, np.int64), None
+    server = _EnvServer()
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
             command, argument = connection.recv()
-            reply = None
             try:
-                if command == "make":
-                    start = time.perf_counter()
-                    worker_index, n_workers, env_indices, memory, makers = argument
-                    current = map_current(memory, n_workers)[worker_index : worker_index + 1]
-                    envs = dict(zip(env_indices, envs.values(), strict=False))  # the environments that exist
-                    for index, pickled in zip(env_indices, makers, strict=False):
-                        current[0] = index
-                        envs[index] = make_env_at(index, partial(_unpickle_and_make, pickled))
-                    reply = tuple(env.spec for env in envs.values()), time.perf_counter() - start
-                elif command == "share":
-                    shared = map_arrays(memory, *argument)
-                elif command == "time steps":
-                    reply = time_steps(next(iter(envs.values())))
-                elif command == "second":
-                    reply = find_interference(next(iter(envs.values())), partial(_unpickle_and_make, argument))
-                else:
-                    assert shared is not None
-                    _call_envs(envs, command, shared, current)
+                reply = server.execute(command, argument)
             except EnvOutputError as error:
                 reply = EnvOutputError(str(error), error.env_index)
             except LareError as error:
                 reply = LareError(str(error))  # another class may be defined where the parent cannot import it
             connection.send(reply)
-    for index, env in envs.items():
+    for index, env in server.envs.items():
         close_env(env, f"environment {index}")
 
 
-def _call_envs(envs: Mapping[int, HostEnv], command: str, shared: SharedArrays, current: Int[np.ndarray, "1"]) -> None:
-    arguments = shared.arguments(command)
-    for index, env in envs.items():
-        if shared.where[index]:
-            current[0] = index
-            call_env(index, env, command, np.copy(arguments[index]), shared.batch)
+class _EnvServer:
+    """The environments of a worker, and the commands on them."""
+
+    def __init__(self):
+        self.envs: dict[int, HostEnv] = {}
+        self._current = np.zeros(1, np.int64)
+        self._shared: SharedArrays
+
+    def execute(self, command: str, argument: Any) -> Any:
+        """Execute a command, and return the reply."""
+        match command:
+            case "make":
+                return self._make(*argument)
+            case "time steps":
+                return time_steps(next(iter(self.envs.values())))
+            case "second":
+                return find_interference(next(iter(self.envs.values())), partial(_unpickle_and_make, argument))
+            case "share":
+                self._shared = map_arrays(*argument)
+            case _:
+                self._call_envs(command)
+        return None
+
+    def _make(
+        self, memory: str, worker_index: int, n_workers: int, env_indices: Sequence[int], makers: Sequence[bytes]
+    ) -> tuple[tuple[EnvSpec, ...], float]:
+        """Make the environments if there are makers, else number those that exist. Return the specifications and the time (s)."""
+        start = time.perf_counter()
+        self._current = map_current(memory, worker_index, n_workers)
+        self.envs = dict(zip(env_indices, self.envs.values(), strict=False))
+        for index, pickled in zip(env_indices, makers, strict=False):
+            self._current[0] = index
+            self.envs[index] = make_env_at(index, partial(_unpickle_and_make, pickled))
+        return tuple(env.spec for env in self.envs.values()), time.perf_counter() - start
+
+    def _call_envs(self, command: str) -> None:
+        shared = self._shared
+        arguments = shared.arguments(command)
+        for index, env in self.envs.items():
+            if shared.where[index]:
+                self._current[0] = index
+                call_env(index, env, command, np.copy(arguments[index]), shared.batch)
 
 
 def _end_with_parent() -> None:
-    """Exit when standard input closes, which happens whenever the parent ends. A step that hangs would not notice this."""
+    """Exit when standard input closes, as it does whenever the parent ends, even if a step hangs."""
     while os.read(0, 1):
         pass
     os._exit(0)

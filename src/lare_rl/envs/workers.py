@@ -1,7 +1,6 @@
 """Environments that step in several worker processes (`worker_process.py`), in lockstep.
 
-Gymnasium's AsyncVectorEnv is not used: it has one process for each environment, steps all of them or none, and does not report
-which one died.
+Gymnasium's AsyncVectorEnv has a process for each environment, steps all or none, and does not say which process died.
 """
 
 import atexit
@@ -25,12 +24,12 @@ from lare_rl.util.processes import n_usable_cores
 __all__ = ["SubprocVecEnv", "close_idle_workers"]
 
 STOP_TIMEOUT_S = 20.0
-"""The time within which an environment must reply once the user has asked the run to stop."""
+"""The time within which an environment must reply after the user has asked the run to stop."""
 POLL_S = 1.0
-"""How often this process looks whether the user has asked the run to stop (s)."""
+"""The time between two looks whether the user has asked the run to stop."""
 
 _idle_workers: defaultdict[str, list[Worker]] = defaultdict(list)
-"""Workers that wait for the next batch of environments, by the key of their environment."""
+"""Workers that wait for the next batch of environments, by `reuse_key`."""
 
 
 @atexit.register
@@ -53,11 +52,11 @@ class SubprocVecEnv(VecEnv):
             makers: one function for each environment. It must be possible to pickle them.
             processes: the number of processes. Default: the number of cores, but at most one for each environment.
             timeout: the time (s) within which an environment must reply.
-            reuse_key: keep the processes, one for each environment, open when the batch is closed, for the next batch with this
-                key. Empty: end them.
+            reuse_key: each environment has its own process, and when the batch is closed, the processes wait for the next batch
+                with this key. Empty: they end.
 
-        Raises `LareError` if an environment cannot be made. Later calls raise it if an environment raises an error, dies or does not
-        reply in time. All workers have then ended.
+        Raises `LareError` if an environment cannot be made. Later calls raise it if an environment fails, dies or does not reply in
+        time. All workers have then ended.
         """
         self.timeout, self._reuse_key = timeout, reuse_key
         self._workers: list[Worker] = []
@@ -71,7 +70,7 @@ class SubprocVecEnv(VecEnv):
                 self._shared = map_arrays(memory, specs[0], n_envs)
                 self._shared.batch.available[:] = True
                 for worker in self._workers:
-                    worker.send("share", (specs[0], n_envs))
+                    worker.send("share", (memory, specs[0], n_envs))
                 self._receive("share")
                 super().__init__(specs[0], self._shared.batch)
         except OSError as error:
@@ -95,19 +94,20 @@ class SubprocVecEnv(VecEnv):
 
     @property
     def make_s(self) -> float:
-        """How long it took to make the environments (s), where it took longest."""
+        """The time (s) in which the slowest worker made its environments."""
         return max(worker.make_s for worker in self._workers)
 
     def measure_step_s(self) -> float:
-        """Return the time that a step of the first environment takes (s), in its process. Raises `LareError` like `step`."""
+        """Return the time (s) of a step of the first environment. Raises `LareError` like `step`."""
         with self._open_workers() as workers:
             workers[0].send("time steps")
             return self._receive("step")[0][1]
 
     def find_interference(self, maker: Maker, timeout: float) -> str | None:
-        """Make a second environment beside the only one, in its process. Return what goes wrong within `timeout` (s), or None.
+        """Make a second environment beside the only one, in its process. Return what goes wrong, or None.
 
-        The batch ends then, because the process may not be what it was. Raises `LareError` if the process died or hangs.
+        The workers end after this, because the second environment may have changed their process. Raises `LareError` if the process
+        dies, or does not reply within `timeout` (s).
         """
         self.timeout = timeout
         with self._open_workers() as workers:
@@ -135,7 +135,7 @@ class SubprocVecEnv(VecEnv):
 
     @contextlib.contextmanager
     def _kill_after_error(self) -> Iterator[None]:
-        """Kill the workers if the block fails: in `__init__`, before the directory of their sockets is removed."""
+        """Kill the workers if the block fails. In `__init__`, they must end before the directory of their sockets is removed."""
         try:
             yield
         except BaseException:  # Ctrl-C too: a pending reply would be taken for the next one
@@ -143,7 +143,7 @@ class SubprocVecEnv(VecEnv):
             raise
 
     def _receive(self, command: str) -> list[tuple[Worker, Any]]:
-        """Return all workers that are busy, with their replies."""
+        """Wait for all busy workers, and return them with their replies."""
         replies = []
         while busy := [worker for worker in self._workers if worker.is_busy]:
             timeout = min(self.timeout, STOP_TIMEOUT_S) if self.stop_requested() else self.timeout
@@ -159,7 +159,7 @@ class SubprocVecEnv(VecEnv):
         return replies
 
     def close(self) -> None:
-        """Close the environments, and kill workers that take too long. With a reuse key, they wait for the next batch."""
+        """End the workers, or let them wait for the next batch with the same `reuse_key`."""
         workers, self._workers = self._workers, []
         if self._reuse_key:
             _idle_workers[self._reuse_key] += workers
@@ -176,7 +176,7 @@ class SubprocVecEnv(VecEnv):
 
 
 def _find_idle_worker(key: str) -> Worker | None:
-    """Return a worker with an environment of this key that no batch uses, or None."""
+    """Return a running worker that waits for a batch with this key, or None."""
     workers = _idle_workers[key] if key else []
     while workers:
         worker = workers.pop()

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.envs.placement import make_host_env
-from lare_rl.envs.play import find_team, phi_inputs, play_steps
+from lare_rl.envs.play import phi_inputs, play_steps
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.factors import compute_batch, find_infinity
 from lare_rl.llm.prompts import FunctionKind, check_kind
@@ -190,7 +190,7 @@ def random_steps(task: TaskSpec, n_steps: int = N_SAMPLE_STEPS, seed: int = 0) -
 def _random_steps(task_json: str, n_steps: int, seed: int) -> Steps:
     role = TaskSpec.model_validate_json(task_json)
     with contextlib.closing(make_host_env(role)) as env:
-        team, rng = find_team(role, env.spec), np.random.default_rng(seed)
+        team, rng = env.spec.find_team(role.team), np.random.default_rng(seed)
         sides = select_states(role.scored_observation, "before", "after")
         rows_by_side: dict[str, list[list[np.ndarray]]] = {side: [] for side in sides}
         n_rows, n_played = 0, 0

@@ -2,6 +2,7 @@
 
 import warnings
 
+import numpy as np
 import pytest
 
 from lare_rl.envs.particles.parallel_env import ParticleParallelEnv
@@ -34,11 +35,11 @@ def test_episode():
     assert picture.std() > 0
 
 
-@pytest.mark.parametrize("action", [5, None])
-def test_invalid_action(action):
+@pytest.mark.parametrize(("action", "text"), [(5, "5"), (None, "None"), (np.eye(2), r"array\(.*")])
+def test_invalid_action(action, text):
     env = ParticleParallelEnv("TriangleArea")
     env.reset(seed=0)
-    with pytest.raises(LareError, match=f"agent_2 is {action}; it must be 0 to 4"):
+    with pytest.raises(LareError, match=f"agent_2 is {text}; it must be 0 to 4"):
         env.step({**dict.fromkeys(env.agents, 0), "agent_2": action})
 
 

@@ -1,5 +1,7 @@
 """Pictures of particle tasks: of a state, and of all steps of an episode."""
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float
 
@@ -13,7 +15,7 @@ LANDMARK_COLOUR = "#9a9a9a"
 """The colour of entities that do not move."""
 CREDIT_COLOURS = colormaps["RdBu"]
 MARGIN = 1.08
-"""The size of the picture relative to the square that it must contain."""
+"""The size of the picture relative to the square of all entities."""
 
 
 def draw_state(
@@ -21,14 +23,7 @@ def draw_state(
 ) -> Figure:
     """Draw a state, to scale. Each agent's credit is a number and a colour."""
     figure, axes = blank_figure()
-    _paint(
-        axes,
-        task,
-        position,
-        _half_side(task, position),
-        credit,
-        None if credit is None else float(np.abs(credit).max()),
-    )
+    _make_painter(task, position[None], None if credit is None else credit[None])(axes, 0)
     return figure
 
 
@@ -38,18 +33,19 @@ def draw_frames(
     credit: Float[np.ndarray, "steps agents"] | None = None,
 ) -> list[Frame]:
     """Draw an episode as pictures with common scales of length and of credit."""
-    side = _half_side(task, positions)
-    scale = None if credit is None else float(np.abs(credit).max())
-
-    def paint(axes: Axes, step: int) -> None:
-        _paint(axes, task, positions[step], side, None if credit is None else credit[step], scale)
-
-    return paint_frames(len(positions), paint)
+    return paint_frames(len(positions), _make_painter(task, positions, credit))
 
 
-def _half_side(task: ParticleTask, position: Float[np.ndarray, "*steps entities 2"]) -> float:
-    outermost = np.abs(position) + task.world.radius[:, None]
-    return float(MARGIN * max(task.half_side, outermost.max()))
+def _make_painter(
+    task: ParticleTask,
+    positions: Float[np.ndarray, "steps entities 2"],
+    credit: Float[np.ndarray, "steps agents"] | None,
+) -> Callable[[Axes, int], None]:
+    """Return a function that draws the state of a step, with the scales of all steps."""
+    outermost = np.abs(positions) + task.world.radius[:, None]
+    side = float(MARGIN * max(task.half_side, outermost.max()))
+    scale = 0.0 if credit is None else float(np.abs(credit).max())
+    return lambda axes, step: _paint(axes, task, positions[step], side, None if credit is None else credit[step], scale)
 
 
 def _paint(
@@ -58,7 +54,7 @@ def _paint(
     position: Float[np.ndarray, "entities 2"],
     side: float,
     credit: Float[np.ndarray, " agents"] | None,
-    scale: float | None,
+    scale: float,
 ) -> None:
     axes.set(xlim=(-side, side), ylim=(-side, side), aspect="equal")
     axes.axis("off")

@@ -22,7 +22,6 @@ from lare_rl.envs.particles.world import State, World, at_rest
 __all__ = ["SIZES", "Size", "make_layouts", "navigation"]
 
 AGENT_RADIUS, LANDMARK_RADIUS = 0.15, 0.05
-"""The radii of both."""
 SENSITIVITY = 5.0
 """The force of an action."""
 SEPARATION = 4.5 * AGENT_RADIUS
@@ -42,7 +41,6 @@ class Size:
     n_agents: int
     """Also the number of landmarks."""
     half_side: float
-    """Half the side of the square."""
 
     @property
     def agents(self) -> range:
@@ -72,7 +70,7 @@ def navigation(name: str) -> ParticleTask:
 
 
 def _world(size: Size) -> World:
-    """Make the world. Agents push each other. Landmarks do not collide with anything."""
+    """Make the world. Agents push each other, landmarks do not."""
     n = size.n_agents
     return World(
         radius=np.array([AGENT_RADIUS] * n + [LANDMARK_RADIUS] * n, np.float32),
@@ -110,26 +108,26 @@ def _reward(size: Size, state: State) -> Float[Array, " agents"]:
 
 
 @cache
-def make_layouts(points: int, radius: float, separation: float) -> Float[np.ndarray, "layouts points 2"]:
-    """Return N_LAYOUTS layouts of `points` points within ±radius, which are further apart than `separation`.
+def make_layouts(n_points: int, half_side: float, separation: float) -> Float[np.ndarray, "layouts n_points 2"]:
+    """Return N_LAYOUTS layouts of points within ±half_side, which are further apart than `separation`.
 
-    The result is always the same. A layout is a uniform choice among the points of a sample that has enough points.
+    A layout is a uniform choice among the points of a Poisson disc sample that has enough of them. The result is always the same.
     """
     rng = np.random.default_rng(0)
     layouts: list[np.ndarray] = []
     while sum(map(len, layouts)) < N_LAYOUTS:
-        samples = _sample_poisson_discs(rng, N_LAYOUTS // 2, 2 * radius, separation)
+        samples = _sample_poisson_discs(rng, N_LAYOUTS // 2, 2 * half_side, separation)
         # A random order of the points, with the missing points last.
         rank = np.where(np.isinf(samples[..., 0]), np.inf, rng.random(samples.shape[:2]))
-        selected = np.argsort(rank, axis=1)[:, :points]
-        selected = np.take_along_axis(samples, selected[..., None], axis=1)
-        layouts.append(selected[np.isfinite(selected).all(axis=(1, 2))])
-    return (np.concatenate(layouts)[:N_LAYOUTS] - radius).astype(np.float32)
+        order = np.argsort(rank, axis=1)[:, :n_points]
+        candidates = np.take_along_axis(samples, order[..., None], axis=1)
+        layouts.append(candidates[np.isfinite(candidates).all(axis=(1, 2))])
+    return (np.concatenate(layouts)[:N_LAYOUTS] - half_side).astype(np.float32)
 
 
 def _sample_poisson_discs(
-    rng: np.random.Generator, samples: int, side: float, separation: float
-) -> Float[np.ndarray, "samples max_points 2"]:
+    rng: np.random.Generator, n_samples: int, side: float, separation: float
+) -> Float[np.ndarray, "n_samples max_points 2"]:
     """Return Poisson disc samples of a square (0, side)^2, computed in lockstep. Missing points of smaller samples are `inf`.
 
     Bridson's algorithm starts with one active point, uniform in the square. It then chooses an active point at random and tries
@@ -138,21 +136,21 @@ def _sample_poisson_discs(
     """
     # Discs with a radius of half the separation do not overlap, and lie within a square of side + separation.
     max_points = int((side + separation) ** 2 / (np.pi * separation**2 / 4))
-    points = np.full((samples, max_points, 2), np.inf)
-    points[:, 0] = side * rng.random((samples, 2))
-    active = np.zeros((samples, max_points), bool)
+    points = np.full((n_samples, max_points, 2), np.inf)
+    points[:, 0] = side * rng.random((n_samples, 2))
+    active = np.zeros((n_samples, max_points), bool)
     active[:, 0] = True
-    n_points = np.ones(samples, int)
-    running = np.arange(samples)
+    n_points = np.ones(n_samples, int)
+    running = np.arange(n_samples)
     while len(running):
         used = n_points.max() + N_CANDIDATES
         centre = np.argmax(rng.random((len(running), min(used, max_points))) * active[running, :used], axis=1)
         active[running, centre] = False
         for _ in range(N_CANDIDATES):
             angle, u = 2 * np.pi * rng.random(len(running)), rng.random(len(running))
-            # 1 + 3 u: uniform by area between 1 and 2 separations.
-            reach = separation * np.sqrt(1 + 3 * u)
-            point = points[running, centre] + reach[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            # The root of 1 + 3 u makes the candidates uniform by area between 1 and 2 separations.
+            distance = separation * np.sqrt(1 + 3 * u)
+            point = points[running, centre] + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
             offset = points[running, :used] - point[:, None]
             is_far = (offset[..., 0] ** 2 + offset[..., 1] ** 2 > separation**2).all(axis=1)
             is_new = is_far & ((point >= 0) & (point < side)).all(axis=1)

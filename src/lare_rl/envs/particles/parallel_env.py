@@ -1,4 +1,4 @@
-"""The particle tasks as PettingZoo environments, for libraries that step one environment at a time on the host."""
+"""The particle tasks as PettingZoo environments, for libraries that step environments on the host."""
 
 from collections.abc import Callable
 from copy import deepcopy
@@ -13,7 +13,7 @@ from jaxtyping import PRNGKeyArray
 from lare_rl.envs.particles.particle_env import ParticleEnv, ParticleState
 from lare_rl.envs.particles.task import N_ACTIONS
 from lare_rl.envs.particles.world import State
-from lare_rl.errors import LareError, missing_extra_error
+from lare_rl.errors import LareError, missing_extra_error, short_repr
 
 try:
     from pettingzoo import ParallelEnv
@@ -52,8 +52,8 @@ class ParticleParallelEnv(ParallelEnv[str, Any, Any]):
         self.possible_agents = [f"{team.name}_{number}" for team in self.task.teams for number in range(team.n_agents)]
         observations, actions = Box(-np.inf, np.inf, (self.task.observation_size,), np.float32), Discrete(N_ACTIONS)
         # Each agent needs its own space, because a space has its own random number generator.
-        self.observation_spaces: dict[str, Space[Any]] = {name: deepcopy(observations) for name in self.possible_agents}
-        self.action_spaces: dict[str, Space[Any]] = {name: deepcopy(actions) for name in self.possible_agents}
+        self.observation_spaces: dict[str, Space] = {agent: deepcopy(observations) for agent in self.possible_agents}
+        self.action_spaces: dict[str, Space] = {agent: deepcopy(actions) for agent in self.possible_agents}
         self.agents: list[str] = []
         self._state: ParticleState | None = None
         self._key = jax.random.key(np.random.default_rng().integers(2**31))
@@ -77,12 +77,13 @@ class ParticleParallelEnv(ParallelEnv[str, Any, Any]):
     def step(
         self, actions: dict[str, Any]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        self._world()
+        self._require_world()
         if not (acted := self.agents):
             return {}, {}, {}, {}, {}
         for agent in acted:
             if not self.action_spaces[agent].contains(actions.get(agent)):
-                raise LareError(f"the action of {agent} is {actions.get(agent)!r}; it must be 0 to {N_ACTIONS - 1}")
+                action = short_repr(actions.get(agent))
+                raise LareError(f"the action of {agent} is {action}; it must be 0 to {N_ACTIONS - 1}")
         one_hot = np.eye(N_ACTIONS, dtype=np.float32)[[int(actions[agent]) for agent in acted]]
         self._state, timestep = self._step(self._state, one_hot, self._next_key())
         ended = bool(timestep.terminated)
@@ -95,13 +96,13 @@ class ParticleParallelEnv(ParallelEnv[str, Any, Any]):
         from lare_rl.envs.canvas import to_pixels
         from lare_rl.envs.particles.drawing import draw_state
 
-        return to_pixels(draw_state(self.task, np.asarray(self._world().position)))
+        return to_pixels(draw_state(self.task, np.asarray(self._require_world().position)))
 
     def state(self) -> np.ndarray:
         """Return the positions and velocities of all entities, in one vector."""
-        return np.concatenate([np.asarray(values).ravel() for values in self._world()])
+        return np.concatenate([np.asarray(values).ravel() for values in self._require_world()])
 
-    def _world(self) -> State:
+    def _require_world(self) -> State:
         if self._state is None:
             raise LareError("there is no episode yet. Call reset first.")
         return self._state.world

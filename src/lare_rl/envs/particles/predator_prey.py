@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from lare_rl.envs.interface import Team
 from lare_rl.envs.particles import views
 from lare_rl.envs.particles.task import ParticleTask
-from lare_rl.envs.particles.world import State, World, at_rest
+from lare_rl.envs.particles.world import State, World, place_uniformly
 
 __all__ = [
     "SIZES",
@@ -51,14 +51,13 @@ DISTANCE_WEIGHT = 0.1
 MARGIN = 0.1
 """Obstacles keep this distance from the border of the square in which all other entities start."""
 
-
 Layers = tuple[tuple[Float[np.ndarray | Array, "_in _out"], Float[np.ndarray | Array, " _out"]], ...]
 """Weight and bias of each layer of the scripted preys' network."""
 
 
 @dataclass(frozen=True)
 class View:
-    """The number of nearest entities of each kind that an agent sees."""
+    """The numbers of nearest entities of each kind that an agent sees."""
 
     landmarks: int
     predators: int
@@ -71,7 +70,7 @@ class View:
 
 @dataclass(frozen=True)
 class Size:
-    """Numbers of entities, their radii, the square in which they start (± half_side), and what agents see."""
+    """The numbers of entities, their radii, the square in which they start (± half_side), and what agents see."""
 
     n_predators: int
     n_preys: int
@@ -121,7 +120,7 @@ def predator_prey(name: str) -> ParticleTask:
 
 
 def competitive() -> ParticleTask:
-    """Make the task in which predators and preys learn. Their observations have the same size, so one network can serve both."""
+    """Make the task in which predators and preys learn. Their observations have the same size, so they can share a network."""
     size = COMPETITIVE
     return ParticleTask(
         name="CompetitivePP-6",
@@ -140,24 +139,25 @@ def make_world(size: Size) -> World:
 
     Entities can thus overlap the drawn obstacles, and a predator must push slightly into a prey to catch it.
     """
-    moving, entities = size.preys.stop, size.obstacles.stop
-    kinds = [size.n_predators, size.n_preys]
+    n_entities, counts = size.obstacles.stop, [size.n_predators, size.n_preys, size.n_landmarks]
+
+    def by_entity(*values: float) -> Float[np.ndarray, " _"]:
+        return np.repeat(values, counts[: len(values)]).astype(np.float32)
+
     return World(
-        radius=np.repeat(
-            [size.predator_radius, size.prey_radius, size.landmark_radius], [*kinds, size.n_landmarks]
-        ).astype(np.float32),
-        n_moving=moving,
-        n_colliding=entities,
-        sensitivity=np.repeat([PREDATOR_SENSITIVITY, PREY_SENSITIVITY], kinds).astype(np.float32),
-        max_speed=np.repeat([PREDATOR_SPEED, PREY_SPEED], kinds).astype(np.float32),
-        contact=np.full((entities, entities), 2 * size.predator_radius, np.float32),
+        radius=by_entity(size.predator_radius, size.prey_radius, size.landmark_radius),
+        n_moving=size.preys.stop,
+        n_colliding=n_entities,
+        sensitivity=by_entity(PREDATOR_SENSITIVITY, PREY_SENSITIVITY),
+        max_speed=by_entity(PREDATOR_SPEED, PREY_SPEED),
+        contact=np.full((n_entities, n_entities), 2 * size.predator_radius, np.float32),
     )
 
 
 def reset(size: Size, key: PRNGKeyArray) -> State:
-    """Place all entities uniformly in their squares. They may overlap."""
-    reach = jnp.array([size.half_side] * size.preys.stop + [size.half_side - MARGIN] * size.n_landmarks)
-    return at_rest(reach[:, None] * jax.random.uniform(key, (len(reach), 2), minval=-1, maxval=1))
+    return place_uniformly(
+        key, jnp.array([size.half_side] * size.preys.stop + [size.half_side - MARGIN] * size.n_landmarks)
+    )
 
 
 def observe_predators(size: Size, state: State) -> Float[Array, "predators observation"]:
@@ -184,9 +184,8 @@ def _observe(size: Size, state: State, observers: range, view: View) -> Float[Ar
 
 def touches(size: Size, state: State) -> Float[Array, "predators preys"]:
     """Return 1 where a predator touches a prey."""
-    return (
-        views.distances(state.position, size.predators, size.preys) < size.predator_radius + size.prey_radius
-    ).astype(jnp.float32)
+    distance = views.distances(state.position, size.predators, size.preys)
+    return (distance < size.predator_radius + size.prey_radius).astype(jnp.float32)
 
 
 def reward_predators(size: Size, state: State) -> Float[Array, " predators"]:
@@ -209,6 +208,7 @@ def shipped_prey() -> Layers:
 
 
 def logits(layers: Layers, observation: Float[Array, "preys observation"]) -> Float[Array, "preys actions"]:
+    """Return the logits of each prey's actions."""
     *hidden, (weight, bias) = layers
     for hidden_weight, hidden_bias in hidden:
         observation = jax.nn.relu(observation @ hidden_weight + hidden_bias)

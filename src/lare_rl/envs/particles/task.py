@@ -1,4 +1,4 @@
-"""The definition of a particle task: a world, and pure functions on single states, without a batch axis."""
+"""The definition of a particle task: a world, and pure functions on a state without a batch axis."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ N_ACTIONS = 5
 
 @dataclass(frozen=True, eq=False)
 class ParticleTask:
-    """A task. Its functions can be compiled and mapped over states, actions and keys.
+    """A task, whose functions can be compiled and mapped over states, actions and keys.
 
     The learning agents are the first entities of its world. Other moving entities follow a script.
 

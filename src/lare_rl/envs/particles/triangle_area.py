@@ -14,24 +14,20 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from lare_rl.envs.interface import Team
 from lare_rl.envs.particles import views
 from lare_rl.envs.particles.task import ParticleTask
-from lare_rl.envs.particles.world import State, World, at_rest
+from lare_rl.envs.particles.world import State, World, place_uniformly
 
 __all__ = ["triangle_area"]
 
 AGENTS, OBSTACLES = range(3), range(3, 6)
 AGENT_RADIUS, OBSTACLE_RADIUS = 0.15, 0.4
-"""The radii of both."""
 SENSITIVITY = 5.0
 """The force of an action."""
 AREA_WEIGHT = 0.1
-AGENT_RANGE = 0.2
-"""Agents start within ±AGENT_RANGE."""
-OBSTACLE_RANGE = 1.5
-"""Obstacles lie within ±OBSTACLE_RANGE."""
+AGENT_RANGE, OBSTACLE_RANGE = 0.2, 1.5
+"""Agents start within ±AGENT_RANGE, obstacles within ±OBSTACLE_RANGE."""
 
 
 def triangle_area() -> ParticleTask:
-    """Make the task."""
     return ParticleTask(
         name="TriangleArea",
         teams=(Team("agent", 0, len(AGENTS)),),
@@ -58,21 +54,19 @@ def _world() -> World:
 
 
 def _reset(key: PRNGKeyArray) -> State:
-    """Place agents and obstacles uniformly. An obstacle may overlap an agent, and then pushes it away."""
-    reach = jnp.array([AGENT_RANGE] * len(AGENTS) + [OBSTACLE_RANGE] * len(OBSTACLES))
-    return at_rest(reach[:, None] * jax.random.uniform(key, (len(reach), 2), minval=-1, maxval=1))
+    """Place agents and obstacles. An obstacle that overlaps an agent pushes it away."""
+    return place_uniformly(key, jnp.array([AGENT_RANGE] * len(AGENTS) + [OBSTACLE_RANGE] * len(OBSTACLES)))
 
 
 def _observe(state: State) -> Float[Array, "agents observation"]:
     """Return each agent's velocity and position; the obstacles, in a fixed order; the other agents, sorted by x and then y."""
-    agents = views.slice_rows(state.position, AGENTS)
     obstacles = jnp.broadcast_to(jnp.array(OBSTACLES), (len(AGENTS), len(OBSTACLES)))
     other_agents = jnp.array([[j for j in AGENTS if j != i] for i in AGENTS])
     offset = views.relative_positions(state.position, AGENTS, other_agents)
     order = jax.vmap(lambda pair: jnp.lexsort((pair[:, 1], pair[:, 0])))(offset)
     return views.concatenate_rows(
         views.slice_rows(state.velocity, AGENTS),
-        agents,
+        views.slice_rows(state.position, AGENTS),
         views.relative_positions(state.position, AGENTS, obstacles),
         jnp.take_along_axis(offset, order[..., None], axis=1),
     )

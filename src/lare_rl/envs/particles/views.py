@@ -43,5 +43,5 @@ def slice_rows(values: Float[Array, "entities 2"], entities: range) -> Float[Arr
 
 
 def concatenate_rows(*arrays: Float[Array, "observers ..."]) -> Float[Array, "observers observation"]:
-    """Flatten arrays to one row for each observer, and concatenate them."""
+    """Flatten each array to a row for each observer, and concatenate the rows."""
     return jnp.concatenate([array.reshape(len(array), -1) for array in arrays], axis=1)

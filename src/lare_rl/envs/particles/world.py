@@ -14,11 +14,12 @@ which is close to CONTACT_FORCE * (d_min - d) if d < d_min, and close to 0 if th
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-__all__ = ["State", "World", "at_rest", "contact_force", "move", "push"]
+__all__ = ["State", "World", "at_rest", "contact_force", "move", "place_uniformly", "push"]
 
 TIME_STEP = 0.1
 DAMPING = 0.25
@@ -37,10 +38,9 @@ class World:
     """The constants of a world. The first `n_moving` entities are agents and preys. The others are landmarks, which do not move."""
 
     radius: Float[np.ndarray, " entities"]
-    """The radii."""
     n_moving: int
     n_colliding: int
-    """The first `n_colliding` entities push each other away: the moving ones, or all."""
+    """The first `n_colliding` entities push each other away. These are the moving entities, or all."""
     sensitivity: Float[np.ndarray, " n_moving"]
     """The force of an action."""
     max_speed: Float[np.ndarray, " n_moving"]
@@ -61,8 +61,13 @@ def at_rest(position: Float[Array, "entities 2"]) -> State:
     return State(position, jnp.zeros_like(position))
 
 
+def place_uniformly(key: PRNGKeyArray, half_side: Float[Array, " entities"]) -> State:
+    """Return a state without motion, with each entity uniform in its own square. Entities may overlap."""
+    return at_rest(half_side[:, None] * jax.random.uniform(key, (len(half_side), 2), minval=-1, maxval=1))
+
+
 def push(world: World, action: Int[Array, " moving"]) -> Float[Array, "moving 2"]:
-    """Return the force of each entity's action on itself."""
+    """Return the force by which each entity's action moves it."""
     return jnp.asarray(world.sensitivity)[:, None] * jnp.asarray(DIRECTIONS)[action]
 
 
@@ -73,12 +78,12 @@ def contact_force(world: World, position: Float[Array, "entities 2"]) -> Float[A
     distance = jnp.sqrt(jnp.sum(offset**2, axis=-1))
     overlap = (world.contact[: world.n_moving] - distance) / CONTACT_MARGIN
     force = CONTACT_FORCE * CONTACT_MARGIN * jnp.logaddexp(overlap, 0)
-    # An entity's distance to itself is 0 too.
+    # The distance of an entity to itself is 0.
     return jnp.sum((force / jnp.where(distance > 0, distance, jnp.inf))[..., None] * offset, axis=1)
 
 
 def move(world: World, state: State, force: Float[Array, "moving 2"]) -> State:
-    """Make one step of TIME_STEP. Contact forces follow from the positions before it."""
+    """Make one step. Contact forces follow from the positions before it."""
     force = force + contact_force(world, state.position)
     velocity = (1 - DAMPING) * state.velocity[: world.n_moving] + TIME_STEP * force
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1))

@@ -43,7 +43,7 @@ TICK = 1 / 16
 TICKS = 8
 """The number of ticks in a step."""
 START_RANGE = 2.0
-"""The largest distance in x and y between a unit and the centre of its side at the start."""
+"""The largest distance in x and in y between a unit and the centre of its side at the start."""
 ALLY_START, ENEMY_START = (FIELD / 4, FIELD / 2), (3 * FIELD / 4, FIELD / 2)
 """The centres of both sides' starts."""
 
@@ -132,7 +132,7 @@ def distances(position: Float[Array, "units 2"]) -> Float[Array, "units units"]:
 
 
 def within_reach(scenario: Scenario, battle: Battle) -> Bool[Array, "units units"]:
-    """Return whether the first unit could hit the second: both are alive, and the distance is small enough."""
+    """Return at [i, j] whether unit i could hit unit j: both are alive, and the distance is small enough."""
     is_alive = alive(battle)
     return (distances(battle.position) < scenario.unit_stats("attack_range")[:, None]) & is_alive[:, None] & is_alive
 
@@ -142,7 +142,7 @@ def separate_units(
 ) -> Float[Array, "units 2"]:
     """Move units that overlap halfway apart, all pairs at once."""
     radius = scenario.unit_stats("radius")
-    # A unit's offset to itself is 0, so that this pair does not move it.
+    # A unit's offset to itself is 0, so it does not move itself: the 1 only avoids a division by almost 0.
     distance = distances(position) + np.eye(scenario.n_units, dtype=np.float32) + 1e-6
     overlap = jax.nn.relu((radius[:, None] + radius) / distance - 1)
     overlap = jnp.where(is_alive[:, None] & is_alive, overlap, 0)

@@ -18,9 +18,9 @@ DEAD_COLOUR = "#bbbbbb"
 
 
 def draw_frames(scenario: Scenario, battles: Battle, credit: Float[np.ndarray, " steps"] | None = None) -> list[Frame]:
-    """Draw an episode as pictures. Each unit is a disc, filled in proportion to its health. Lines show the hits of a step.
+    """Draw an episode as pictures. Each unit is a disc, filled in proportion to its health. Lines are the hits of a step.
 
-    `battles` are the states, along a leading axis. The credit of the step before a state is shown as a number.
+    `battles` has a leading axis of steps. The number is the credit of the step.
     """
     battles = jax.tree.map(np.asarray, battles)
     states = [jax.tree.map(itemgetter(step), battles) for step in range(len(battles.step))]

@@ -37,12 +37,8 @@ def choose_actions(
     scenario: Scenario, battle: Battle, memory: Memory, key: PRNGKeyArray
 ) -> tuple[Int[Array, " enemies"], Memory]:
     """Return the action of each enemy unit. Its attacks count our units from the last to the first."""
-    n_allies = scenario.n_allies
-    attack_range, sight = (
-        scenario.unit_stats("attack_range")[n_allies:, None],
-        scenario.unit_stats("sight")[n_allies:, None],
-    )
-    is_alive = alive(battle)
+    n_allies, is_alive = scenario.n_allies, alive(battle)
+    attack_range, sight = (scenario.unit_stats(stat)[n_allies:, None] for stat in ("attack_range", "sight"))
     offset = battle.position[:n_allies] - battle.position[n_allies:, None]
     distance = jnp.sqrt(jnp.sum(offset**2, axis=-1))
     visible = (distance < sight) & is_alive[n_allies:, None] & is_alive[:n_allies]
@@ -55,10 +51,10 @@ def choose_actions(
     attacked = jnp.where(attacks, jnp.where(keeps, memory.attacked, closest), -1).astype(jnp.int32)
 
     random_unit = jnp.argmax(jnp.where(visible, jax.random.uniform(key, visible.shape), -1), axis=1)
-    towards = jnp.sum(jnp.where(jax.nn.one_hot(random_unit, n_allies, dtype=bool)[..., None], offset, 0), axis=1)
-    goal = memory.goal - battle.position[n_allies:]
-    way = jnp.where(jnp.any(visible, axis=1)[:, None], towards, goal)
-    walk = jnp.argmax(way @ DIRECTIONS.T, axis=1)
+    to_unit = jnp.sum(jnp.where(jax.nn.one_hot(random_unit, n_allies, dtype=bool)[..., None], offset, 0), axis=1)
+    to_goal = memory.goal - battle.position[n_allies:]
+    to_target = jnp.where(jnp.any(visible, axis=1)[:, None], to_unit, to_goal)
+    walk = jnp.argmax(to_target @ DIRECTIONS.T, axis=1)
 
     action = jnp.where(attacks, ATTACK + n_allies - 1 - attacked, walk)
     action = jnp.where(is_alive[n_allies:], action, STOP)

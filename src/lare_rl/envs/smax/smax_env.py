@@ -1,6 +1,6 @@
 """SMAX: StarCraft-like battles (Rutherford et al., JaxMARL, 2024) in JAX, as a `JaxEnv`.
 
-    reward = 10 * (sum of the enemy's health lost in the step, as shares, / enemies + 1 if the step won the battle)
+    reward = 10 * (mean over the enemy's units of the share of health lost in the step + 1 if the step won the battle)
 
 which is 10 times the reward of SMAX, so that the largest return of an episode is 20, as in SMAC (Samvelyan et al., 2019).
 """
@@ -120,7 +120,7 @@ def _observation_size(scenario: Scenario) -> int:
 
 
 def _state_size(scenario: Scenario) -> int:
-    return scenario.n_units * (4 + scenario.n_unit_types) + 2 * scenario.n_units
+    return scenario.n_units * (6 + scenario.n_unit_types)
 
 
 def _one_hot_unit_types(scenario: Scenario) -> Float[np.ndarray, "units unit_types"]:
@@ -128,7 +128,7 @@ def _one_hot_unit_types(scenario: Scenario) -> Float[np.ndarray, "units unit_typ
 
 
 def observe(scenario: Scenario, battle: Battle) -> Float[Array, "allies observation"]:
-    """Return the observation of each of our units: all other units one by one, ours first, and then the unit itself.
+    """Return the observation of each of our units: all other units, ours first, and then the unit itself.
 
     For another unit: health as a share, offset in units of the observer's sight (x, y), its last move (x, y), its last attack as a
     share of its actions (0 for none), cooldown as a share between 0 and 1, type as one-hot; zeros if it is dead or not in sight.
@@ -145,8 +145,8 @@ def observe(scenario: Scenario, battle: Battle) -> Float[Array, "allies observat
     offset = battle.position - battle.position[:n_allies, None]
     sight = scenario.unit_stats("sight")[:n_allies, None]
     visible = (jnp.sqrt(jnp.sum(offset**2, axis=-1)) < sight) & is_alive[:n_allies, None] & is_alive
-    rest = jnp.concatenate([move_direction(battle.action), attack, cooldown, unit_types], axis=1)
-    columns = [health[None], offset / sight[..., None], rest[None]]
+    action_and_type = jnp.concatenate([move_direction(battle.action), attack, cooldown, unit_types], axis=1)
+    columns = [health[None], offset / sight[..., None], action_and_type[None]]
     other_units = jnp.concatenate(
         [jnp.broadcast_to(column, (n_allies, n_units, column.shape[-1])) for column in columns], axis=2
     )

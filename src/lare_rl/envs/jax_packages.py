@@ -1,4 +1,4 @@
-"""What the families of JAX environments share: their packages, actions, flat observations, and a single agent as a team."""
+"""What the adapters of JAX packages share: imports, flat observations, actions, the adapter of a single agent, and pictures."""
 
 import contextlib
 import importlib
@@ -38,12 +38,11 @@ __all__ = [
     "mask_combinations",
     "raw_key",
     "read_measures",
-    "strong_types",
     "unusable",
 ]
 
 MAX_COMBINATIONS = 1024
-"""The largest number of combinations of several choices that become a single choice."""
+"""The largest number of discrete actions that may stand for the combinations of a multi-discrete action."""
 TRAINABLE_ACTIONS = "LaRe trains discrete actions and bounded continuous ones"
 
 
@@ -51,7 +50,7 @@ TRAINABLE_ACTIONS = "LaRe trains discrete actions and bounded continuous ones"
 
 
 def import_package(name: str, task: TaskSpec) -> ModuleType:
-    """Import a package of an environment, without what it prints. Raises `LareError`, which names the extra, if that fails."""
+    """Import the package of an environment, and hide what it prints. Raises `LareError`, which names the extra, if that fails."""
     try:
         with _silence():
             return importlib.import_module(name)
@@ -77,9 +76,9 @@ def _silence() -> Iterator[None]:
 def construct(
     task: TaskSpec, names: Iterable[str], make: Callable[..., Any], arguments: Mapping[str, Any] | None = None
 ) -> Any:
-    """Return the result of `make` for the environment's name and the task's arguments, or `arguments`.
+    """Call `make` with the environment's name and `arguments`, by default the task's.
 
-    Raises `LareError` if the name is not among the package's names, or if `make` raises an error.
+    Raises `LareError` if the name is not among the package's `names`, or if `make` raises an error.
     """
     name, names = task.name_in_family, list(names)
     message = f"environment {task.environment!r} cannot be made"
@@ -98,12 +97,12 @@ def unusable(environment: str, reason: str) -> LareError:
 
 
 def raw_key(key: PRNGKeyArray) -> Array:
-    """Return a key as an array of integers, because checkpoints cannot store typed keys in an environment's state."""
+    """Return a key as an array of integers, because packages store keys in states, and checkpoints cannot store typed keys."""
     return jax.random.key_data(key)
 
 
 def flatten_tree(tree: Any) -> Float[Array, " size"]:
-    """Return all arrays of a tree in one vector: leaf after leaf, and the entries of a leaf row by row."""
+    """Return all arrays of a tree in one vector: leaf after leaf, each row by row."""
     leaves = [jnp.ravel(jnp.asarray(leaf)).astype(jnp.float32) for leaf in jax.tree.leaves(tree)]
     return jnp.concatenate(leaves) if leaves else jnp.zeros(0)
 
@@ -113,23 +112,18 @@ def flat_size(tree: Any) -> int:
     return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
 
 
-def strong_types(tree: Any) -> Any:
-    """Return a tree of arrays without weak types, which a compiled step would change."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype), tree)
-
-
 def cast_like(tree: Any, reference: Any) -> Any:
-    """Return a tree with the types of another one of the same structure, so that a state has one type at all steps."""
+    """Return a tree with the types of a reference, without weak types, so that a state has the same types at all steps."""
     return jax.tree.map(lambda leaf, other: jnp.asarray(leaf, jnp.asarray(other).dtype), tree, reference)
 
 
 def find_measures(task: TaskSpec, values: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the task's measures that are among a package's values and are numbers."""
+    """Return the names of the task's measures that are numbers among a package's values."""
     return tuple(name for name in task.info_keys if name in values and math.prod(jnp.shape(values[name])) == 1)
 
 
 def read_measures(spec: EnvSpec, values: Mapping[str, Any]) -> dict[str, Float[Array, ""]]:
-    """Return the measures of a step from a package's values, and 0 for those that it does not report."""
+    """Return the measures of a step from a package's values. A measure without a value is 0."""
     return {name: jnp.asarray(values.get(name, 0.0), jnp.float32).reshape(()) for name in spec.measures}
 
 
@@ -139,7 +133,7 @@ def read_measures(spec: EnvSpec, values: Mapping[str, Any]) -> dict[str, Float[A
 def action_fields(space: Any, environment: str) -> dict[str, Any]:
     """Return the fields of `EnvSpec` about actions, from a space of gymnax or a specification of Jumanji.
 
-    Several choices at a time are one choice: of all their combinations, the last choice changing fastest. Raises `LareError` if
+    The combinations of a multi-discrete action are discrete actions, and its last component changes fastest. Raises `LareError` if
     these are too many, or if actions are neither discrete nor bounded.
     """
     n_values = getattr(space, "n", getattr(space, "num_values", None))
@@ -148,12 +142,7 @@ def action_fields(space: Any, environment: str) -> dict[str, Any]:
         if (size := math.prod(sizes)) > MAX_COMBINATIONS:
             combinations = f"{size} combinations, more than {MAX_COMBINATIONS}"
             raise unusable(environment, f"its {len(sizes)} choices at a time have {combinations}")
-        return {
-            "discrete": True,
-            "action_size": size,
-            "choice_sizes": sizes if shape else (),
-            "package_shape": shape,
-        }
+        return {"discrete": True, "action_size": size, "choice_sizes": sizes if shape else (), "package_shape": shape}
     for low, high in (("low", "high"), ("minimum", "maximum")):
         if hasattr(space, low) and np.issubdtype(space.dtype, np.floating):
             return bounded_action(getattr(space, low), getattr(space, high), space.shape, environment)
@@ -169,7 +158,7 @@ def bounded_action(low: Any, high: Any, shape: Sequence[int], environment: str) 
 
 
 def mask_combinations(mask: Bool[Array, "..."], sizes: tuple[int, ...]) -> Bool[Array, " combinations"]:
-    """Return which combinations of choices are available, from a mask of all combinations or of each choice."""
+    """Return which combinations of a multi-discrete action are available, from a mask of combinations or of each component."""
     if mask.ndim == 1 or mask.shape == sizes:
         return mask.ravel()
     combinations = jnp.ones((), bool)
@@ -193,15 +182,15 @@ class AgentEnv:
         draw: Callable[[list[Any]], Sequence[Any]],
         *,
         max_steps: int,
-        **action: Any,
+        **action_spec: Any,
     ):
         """Make the adapter from functions that call the package's environment.
 
         Args:
-            reset: from a raw key to a state, and the arguments of `agent_timestep` by name.
-            step: from a state, an action of the package and a raw key to the same.
-            draw: from a list of states to their pictures.
-            action: the fields of `EnvSpec` about actions.
+            reset: returns a state and the arguments of `agent_timestep` by name, from a raw key.
+            step: returns the same, from a state, an action of the package and a raw key.
+            draw: returns the pictures of a list of states.
+            action_spec: the fields of `EnvSpec` about actions.
         """
         self.env, self._name = env, task.environment
         self._reset, self._step, self._draw = reset, step, draw
@@ -215,19 +204,19 @@ class AgentEnv:
             masks_actions=outputs.get("available") is not None,
             is_jax=True,
             measures=find_measures(task, outputs.get("measures") or {}),
-            **action,
+            **action_spec,
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[Any, Timestep]:
         state, outputs = self._reset(raw_key(key))
-        return strong_types(state), agent_timestep(self.spec, **outputs)
+        return cast_like(state, state), agent_timestep(self.spec, **outputs)
 
     def step(self, state: Any, action: Float[Array, "1 action"], key: PRNGKeyArray) -> tuple[Any, Timestep]:
         next_state, outputs = self._step(state, to_package_action(action[0], self.spec), raw_key(key))
         return cast_like(next_state, state), agent_timestep(self.spec, **outputs)
 
     def frames(self, states: Any, credit: Any = None) -> list[np.ndarray]:
-        """Return the package's pictures of states, which do not show credit. Raise `LareError` if it cannot draw them here."""
+        """Return the package's pictures, which do not show credit. Raises `LareError` if it cannot draw them here."""
         return draw_states(self._name, self._draw, states)
 
 
@@ -242,9 +231,9 @@ def agent_timestep(
     state: Any = None,
     measures: Mapping[str, Any] | None = None,
 ) -> Timestep:
-    """Return a timestep of one agent. By default all actions are available. If a mask has none, the first is.
+    """Return a timestep of a single agent, from trees of arrays as observation and state.
 
-    The observation and the state are trees of arrays.
+    By default all actions are available. If a mask has none, the first is available.
     """
     if available is None:
         available = jnp.ones(spec.action_size, bool)
@@ -264,7 +253,7 @@ def agent_timestep(
 
 
 def draw_states(environment: str, draw: Callable[[list[Any]], Sequence[Any]], states: Any) -> list[np.ndarray]:
-    """Return the pictures that a package draws of an episode's states (leading axis: steps). Raise `LareError` if it cannot draw here."""
+    """Return a package's pictures of an episode's states (leading axis: steps). Raises `LareError` if it cannot draw them here."""
     with one_line_errors(f"environment {environment!r} cannot be drawn here", _render_hint), _silence():
         leaves, structure = jax.tree.flatten(jax.device_get(states))
         by_step = [jax.tree.unflatten(structure, step) for step in zip(*leaves, strict=True)]
@@ -272,7 +261,7 @@ def draw_states(environment: str, draw: Callable[[list[Any]], Sequence[Any]], st
 
 
 def draw_updates(visualizer: Any, n_states: int) -> list[np.ndarray]:
-    """Return the pictures of a visualizer whose `update` draws the state of an index on its figure. The figure is closed."""
+    """Return the pictures that a visualizer draws on its figure when `update` is called with an index. Close the figure."""
     from matplotlib import pyplot
 
     from lare_rl.envs.canvas import to_pixels
