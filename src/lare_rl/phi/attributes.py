@@ -130,11 +130,13 @@ def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
                 return Bound(lambda: owner if name == "item" else float(owner).is_integer())
         case Function() if name == "__name__":
             return owner.name
-        case Masked() if name in ("clip", "astype", "round", "copy"):
-            return Bound(lambda *args, **kwargs: call_numpy(name, [owner, *args], kwargs) if name != "copy" else owner)
-    if isinstance(owner, Masked):
-        text = f"x[mask].{name[:60]}: rows differ in what a mask selects: use np.where(mask, x, 0)"
-        raise RefusedError("E-ROWS", text)
+        case Masked() if name == "copy":
+            return Bound(lambda: owner)
+        case Masked() if name in ("clip", "round"):
+            return Bound(lambda *args, **kwargs: call_numpy(name, [owner, *args], kwargs))
+        case Masked():
+            text = f"x[mask].{name[:60]}: rows differ in what a mask selects: use np.where(mask, x, 0)"
+            raise RefusedError("E-ROWS", text)
     raise RefusedError("E-ATTRIBUTE", f".{name[:60]} of a {value_type(owner)} is not available")
 
 
@@ -148,7 +150,7 @@ def module_attribute(module: str, name: str) -> Any:
         return Symbol(full)
     if module.startswith("np"):
         short = full.removeprefix("np.")
-        if short in FUNCTIONS or short in INDEXED or short in KIND_OF_DTYPE or f"{short}.outer" in FUNCTIONS:
+        if short in FUNCTIONS or full in INDEXED or short in KIND_OF_DTYPE or f"{short}.outer" in FUNCTIONS:
             return Symbol(full)
         raise RefusedError("E-NUMPY", f"{full[:80]} is not available{_hint(full)}")
     raise RefusedError("E-ATTRIBUTE", f"{full[:80]} is not available{_hint(full)}")
@@ -178,7 +180,7 @@ def _array_attribute(runtime: Runtime, array: Array, name: str) -> Any:
         case "dtype":
             return Symbol({"float": "np.float32", "int": "np.int64", "bool": "np.bool_"}[array.kind])
         case "flat":
-            return list(runtime.items(call_numpy("ravel", [array], {})))
+            return tuple(runtime.items(call_numpy("ravel", [array], {})))  # so that nothing is written into a copy
         case "item":
             return Bound(lambda *index: (array[index] if index else array).number())
         case "tolist":

@@ -204,7 +204,9 @@ def new_instance(runtime: Runtime, cls: Class, args: Sequence[Any], kwargs: Mapp
     instance.attributes |= dict(zip(fields, args, strict=False)) | dict(kwargs)
     for name in fields:
         if name not in instance.attributes:
-            instance.attributes[name] = cls.find(name)
+            default = cls.find(name)
+            is_factory = isinstance(default, Decorated) and default.kind == "default_factory"
+            instance.attributes[name] = runtime.call(default.function, [], {}) if is_factory else default
     if cls.has("__post_init__"):
         runtime.call(class_attribute(runtime, instance, "__post_init__"), [], {})
     return instance

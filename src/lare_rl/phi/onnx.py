@@ -46,7 +46,7 @@ COMPOSED: dict[str, Callable[..., str]] = {
     "hypot": lambda op, x, y: op("Sqrt", op("Add", op("Mul", x, x), op("Mul", y, y))),
     "left_shift": lambda op, x, y: op("Mul", x, op("Pow", np.array(2), y)),
 }
-"""Operations that are some operations of ONNX. `op` adds one of them."""
+"""Operations that are several operations of ONNX. `op` adds one of these."""
 DTYPES = {"float": np.float32, "int": np.int64, "bool": np.bool_}
 """The types of inputs and outputs."""
 
@@ -84,7 +84,7 @@ def onnx_model(graph: Graph, name: str) -> Any:
 
 
 class _Writer:
-    """Writes operations, with one batch axis in front of every result that is no constant."""
+    """Collects operations and constants of ONNX. Every result but a constant has one batch axis in front."""
 
     def __init__(self, graph: Graph):
         self.graph, self.nodes, self.constants = graph, [], []
@@ -136,9 +136,7 @@ class _Writer:
             case "argmax" | "argmin":
                 numbers = self.cast(x[0], "float") if inputs[0].kind == "bool" else x[0]
                 return op({"argmax": "ArgMax", "argmin": "ArgMin"}[node.op], numbers, axis=option, keepdims=0)
-            case "any" | "all":
-                return self.cast(op(REDUCTIONS[node.op], self.cast(x[0], "int"), np.array(option), keepdims=0), "bool")
-            case "sum" | "prod" | "max" | "min":
+            case "sum" | "prod" | "max" | "min" | "any" | "all":
                 numbers = self.cast(x[0], "int") if kind == "bool" else x[0]
                 result = op(REDUCTIONS[node.op], numbers, np.array(option, int), keepdims=0)
                 return self.cast(result, "bool") if kind == "bool" else result

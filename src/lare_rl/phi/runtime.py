@@ -1,4 +1,4 @@
-"""What functions of a program need of the interpreter, which they take first, and what a program may spend.
+"""The interface of the interpreter, which the functions of Python take as their first argument; and what a program may spend.
 
 Everything that takes time or memory is paid for before it happens.
 """
@@ -12,9 +12,12 @@ from typing import Any
 from lare_rl.phi.arrays import Array
 from lare_rl.phi.builder import Builder
 from lare_rl.phi.limits import MAX_INT_BITS, MAX_KEY_LENGTH, MAX_LIST_LENGTH, MAX_STEPS, MAX_TEXT_LENGTH, RefusedError
-from lare_rl.phi.values import Instance, Scope, Symbol
+from lare_rl.phi.values import Instance, Scope, Set, Symbol
 
-__all__ = ["Meter", "Runtime", "builtin", "check_key", "check_number", "check_text", "check_text_length", "varies"]
+__all__ = [
+    "BUILTINS", "Meter", "Runtime", "builtin", "builtin_variants", "check_key", "check_number", "check_text",
+    "check_text_length", "make_set", "varies",
+]  # fmt: skip
 
 
 class Meter:
@@ -37,7 +40,7 @@ class Meter:
         return values
 
     def pay_for_all_within(self, values: Iterable[Any]) -> None:
-        """Pay for values and all that they contain. A list that holds another one twice, and so on, has very many entries."""
+        """Pay for values and all that they contain: a list of two lists of two lists ... has very many entries."""
         stack = list(values)
         while stack:
             value = stack.pop()
@@ -83,14 +86,18 @@ def check_key(value: Any) -> Any:
     return value
 
 
+def make_set(values: Iterable[Any]) -> Set:
+    return Set(dict.fromkeys(map(check_key, values)))
+
+
 class Runtime(ABC):
-    """A program that is carried out. `Interpreter` says where each method is defined."""
+    """A program that is being carried out. `Interpreter` says where each method is defined."""
 
     builder: Builder
     meter: Meter
     module: Scope
     line: int
-    """Line that is being carried out."""
+    """Line of the present statement."""
     call_depth: int
 
     @abstractmethod
@@ -117,7 +124,7 @@ class Runtime(ABC):
 
 
 BUILTINS: dict[str, Callable[..., Any]] = {}
-"""All functions, by names such as "len", "math.sqrt", "itertools.product"."""
+"""Functions of Python, by names such as "len", "math.sqrt", "itertools.product"."""
 
 
 def builtin(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -131,7 +138,7 @@ def builtin(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
 
 def builtin_variants(table: Mapping[str, Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Register one function for each row of a table: a name, and the value that it takes before the runtime."""
+    """Register a function under each name of a table, whose value it takes before the runtime."""
 
     def register(function: Callable[..., Any]) -> Callable[..., Any]:
         BUILTINS.update({name: functools.partial(function, variant) for name, variant in table.items()})

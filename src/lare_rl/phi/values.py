@@ -52,7 +52,7 @@ class Bound(_Value):
 
 @dataclass(eq=False, repr=False)
 class Decorated(_Value):
-    """A static method, a class method or a property."""
+    """A static method, a class method, a property, or the `default_factory` of a dataclass's field."""
 
     kind: str
     function: Any

@@ -79,10 +79,16 @@ def arange(start: Any, stop: Any = None, step: Any = 1, dtype: Any = None) -> Ar
 
 @numpy_variants({"linspace": np.linspace, "logspace": np.logspace, "geomspace": np.geomspace})
 def series(
-    function: Any, start: float, stop: float, num: int = 50, endpoint: Any = True, base: float = 10.0, dtype: Any = None
+    function: Any,
+    start: float,
+    stop: float,
+    num: int = 50,
+    endpoint: Any = True,
+    base: float | None = None,
+    dtype: Any = None,
 ) -> Array:
     current_builder().check_size([num])
-    more = {"base": base} if function is np.logspace else {}
+    more = {} if base is None else {"base": base}
     return as_array(function(start, stop, num, bool(endpoint), dtype=dtype_kind(dtype or "float"), **more))
 
 
@@ -131,10 +137,10 @@ def _read_range(item: Any) -> Array:
 
 
 INDEXED = {
-    "r_": Indexed(lambda items: rearrange(lambda arrays: np.r_[tuple(arrays)], items)),
-    "c_": Indexed(lambda items: rearrange(lambda arrays: np.c_[tuple(arrays)], items)),
-    "mgrid": Indexed(lambda ranges: stack(meshgrid(*ranges, indexing="ij"), 0), is_grid=True),
-    "ogrid": Indexed(lambda ranges: meshgrid(*ranges, indexing="ij", sparse=True), is_grid=True),
+    "np.r_": Indexed(lambda items: rearrange(lambda arrays: np.r_[tuple(arrays)], items)),
+    "np.c_": Indexed(lambda items: rearrange(lambda arrays: np.c_[tuple(arrays)], items)),
+    "np.mgrid": Indexed(lambda ranges: stack(meshgrid(*ranges, indexing="ij"), 0), is_grid=True),
+    "np.ogrid": Indexed(lambda ranges: meshgrid(*ranges, indexing="ij", sparse=True), is_grid=True),
 }
 """Objects of NumPy that are used with an index."""
 

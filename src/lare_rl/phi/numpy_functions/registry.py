@@ -242,4 +242,5 @@ _CONVERSIONS: dict[str, Callable[[Any], Any]] = {
     "float": as_float,
     "Operand | None": _optional(as_operand),
     "int | None": _optional(operator.index),
+    "float | None": _optional(as_float),
 }

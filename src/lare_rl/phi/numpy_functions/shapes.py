@@ -19,12 +19,14 @@ from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import RefusedError
+from lare_rl.phi.numpy_functions.reductions import flatten_constant
 from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
     array_functions,
     as_arrays,
     as_list,
     as_sizes,
+    astype,
     numpy_function,
     numpy_functions,
     numpy_variants,
@@ -176,19 +178,24 @@ def pad(array: Array, pad_width: Any, mode: Any = "constant", *, constant_values
     if mode != "constant":
         text = f"np.pad, mode={str(mode)[:40]!r}: use constant, edge, reflect, symmetric or wrap"
         raise RefusedError("E-NUMPY", text)
-    fill = as_array(as_array(constant_values).number())
+    fill = astype(as_array(constant_values).number(), array.kind)
     return rearrange(lambda both: np.pad(both[0], widths, constant_values=both[1]), [array, fill])
+
+
+def _flatten_without_axis(arr: Array, axis: Any) -> tuple[Array, int]:
+    """Return an array and one of its axes; without `axis`, all its numbers in one axis."""
+    return (flatten_constant(arr), 0) if axis is None else (arr, arr.row_axes(axis)[0])
 
 
 @numpy_function()
 def delete(arr: Array, obj: Any, axis: Any = None) -> Any:
-    at = arr.row_axes(0 if axis is None and arr.ndim == 1 else axis)[0]
+    arr, at = _flatten_without_axis(arr, axis)
     return rearrange(np.delete, arr, obj, at)
 
 
 @numpy_function()
 def insert(arr: Array, obj: int, values: Array, axis: Any = None) -> Any:
-    at = arr.row_axes(0 if axis is None and arr.ndim == 1 else axis)[0]
+    arr, at = _flatten_without_axis(arr, axis)
     length = arr.row_shape[at]
     current_builder().check_size([math.prod(arr.row_shape) // length, length + math.prod(values.row_shape)])
     return rearrange(lambda both: np.insert(both[0], obj, both[1], at), [arr, values])
@@ -238,9 +245,19 @@ def copyto(dst: Array, src: Any, casting: Any = "same_kind", where: Any = True) 
 
 @numpy_function()
 def fill_diagonal(a: Array, val: Any) -> None:
-    a.row_axes(None)
-    step = sum(math.prod(a.row_shape[i + 1 :]) for i in range(a.ndim))
-    a.reshaped((-1,), None)[: a.row_shape[1] ** 2 : step] = val
+    a.row_axes(None)  # refuses the batch axis
+    if a.ndim < 2 or (a.ndim > 2 and len(set(a.row_shape)) > 1):
+        raise ValueError(f"np.fill_diagonal of the shape {a.shape}: use a matrix, or an array with axes of one length")
+    a[(list(range(min(a.row_shape))),) * a.ndim] = val
+
+
+@numpy_variants({"putmask": True, "place": False})
+def write_masked(is_aligned: bool, a: Array, mask: Array, values: Array) -> None:
+    """Write where a mask is true: a single number; or, if `is_aligned`, each number at the same place as in `values`."""
+    is_single = values.batch_axis is None and math.prod(values.row_shape) == 1
+    if not is_single and not (is_aligned and values.layout == a.layout):
+        raise RefusedError("E-NUMPY", "np.putmask and np.place repeat values: write a[...] = np.where(mask, values, a)")
+    copyto(a, values, where=mask)
 
 
 array_functions({"take_along_axis": lambda arr, indices, axis=-1: arr[_along_axis(arr, indices, axis)]})
@@ -249,6 +266,5 @@ numpy_functions(
         "put_along_axis": lambda arr, indices, values, axis: as_array(arr).__setitem__(
             _along_axis(as_array(arr), as_array(indices), axis), values
         ),
-        "putmask place": lambda a, mask, values: copyto(as_array(a), values, where=as_array(mask)),
     }
 )

@@ -25,10 +25,10 @@ OPERATORS: dict[str, type[ast.operator]] = {
 
 
 TEXTS: dict[type, str] = {
-    float: r"\s*[-+]?(\d{1,30}\.?\d{0,30}([eE][-+]?\d{1,3})?|inf|infinity|nan)\s*",
+    float: r"\s*[-+]?((\d{1,30}\.?\d{0,30}|\.\d{1,30})(e[-+]?\d{1,3})?|inf|infinity|nan)\s*",
     int: r"\s*[-+]?\d{1,18}\s*",
 }
-"""What a text of a number looks like."""
+"""What a text of a number looks like, in upper or lower case."""
 
 
 @builtin_variants({"float": float, "int": int})
@@ -39,7 +39,7 @@ def number(kind: type, _: Runtime, /, x: Any = 0) -> Any:
     if varies([x]):
         raise RefusedError("E-FLOW", f"{name}() of numbers that differ from row to row: use astype({name})")
     if isinstance(x, str) and not re.fullmatch(TEXTS[kind], x, re.IGNORECASE):
-        raise TypeError(f"{name}() of {x[:40]!r}")
+        raise ValueError(f"{name}() of {x[:40]!r}")
     if not isinstance(x, (bool, int, float, str, Array)):
         raise TypeError(f"{name}() of a value that is no number")
     return check_number(kind(x))
