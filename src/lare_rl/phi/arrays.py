@@ -43,17 +43,13 @@ class _ArrayLike(Operand):
 class Array(_ArrayLike):
     """An array of a program: a node of the graph, or a view of another array, its base."""
 
+    read_only = False  # True for the inputs
+
     def __init__(
-        self,
-        node: int,
-        batch_axis: int | None,
-        base: Array | None = None,
-        positions: np.ndarray | None = None,
-        read_only: bool = False,
+        self, node: int, batch_axis: int | None, base: Array | None = None, positions: np.ndarray | None = None
     ):
-        self._node, self.batch_axis, self.read_only = node, batch_axis, read_only
+        self._node, self.batch_axis, self.positions = node, batch_axis, positions
         self.base = self if base is None else base
-        self.positions = positions
 
     @property
     def node(self) -> int:
@@ -153,7 +149,7 @@ class Array(_ArrayLike):
         return Source(all_positions(self.row_shape) if self.positions is None else self.positions, self.batch_axis)
 
     def reshaped(self, row_shape: Sequence[int], batch_axis: int | None) -> Array:
-        """Return the array in another shape, whose batch axis is known."""
+        """Return the array in another shape of the graph, with its batch axis there."""
         return self.moved(self.source.positions.reshape(row_shape), batch_axis)
 
     def moved(self, positions: np.ndarray, batch_axis: int | None) -> Array:
@@ -190,9 +186,7 @@ class Array(_ArrayLike):
             if isinstance(value, Masked) and value.mask.node == region.mask.node:
                 value = value.values
             elif isinstance(value, Array) and value.batch_axis is not None:
-                raise ValueError(
-                    "x[mask] = y differs from row to row: write x[mask] = y[mask], or np.where(mask, y, x)"
-                )
+                raise ValueError("x[mask] = y, where y has rows: write x[mask] = y[mask], or np.where(mask, y, x)")
             mask = region.mask[(..., *(None,) * (region.values.ndim - region.mask.ndim))]
             self[masked_index(self.layout, entries)] = elementwise("where", mask, value, region.values)
         elif any(isinstance(entry, Array) for entry in entries):
@@ -292,9 +286,9 @@ def power(x: Any, exponent: Any) -> Any:
         return elementwise("power", x, exponent)
     if value == 0.5:
         return elementwise("sqrt", x)
-    if isinstance(value, float):
-        x = elementwise("multiply", x, 1.0)
     x = x if isinstance(x, Operand) else as_array(x)
+    if isinstance(value, float) or getattr(x, "kind", None) == "bool":
+        x = elementwise("multiply", x, 1.0 if isinstance(value, float) else 1)
     square = elementwise("multiply", x, x)
     if value <= 2:
         return x if value == 1 else square
@@ -340,9 +334,7 @@ def rearrange(function: Callable[..., Any], arrays: Any, *args: Any) -> Any:
         zeros = [builder.cast(builder.constant(0), kind)] if has_zeros else []
         return Array(builder.gather(builder.concat([*nodes, *zeros]), positions % (size + 1)), batch_axis)
 
-    if isinstance(moved, Source):
-        return to_array(moved)
-    return (list if isinstance(moved, list) else tuple)(map(to_array, moved))
+    return to_array(moved) if isinstance(moved, Source) else type(moved)(map(to_array, moved))
 
 
 def broadcast(array: Array, shape: Sequence[Any]) -> Array:

@@ -33,16 +33,14 @@ MODULES = {
 """Modules that can be imported. They have only the names below and the functions of `python_functions` and `numpy_functions`."""
 
 NAMES = frozenset(
-    "dataclasses.dataclass dataclasses.field enum.Enum enum.IntEnum enum.IntFlag enum.auto abc.ABC abc.abstractmethod "
-    "collections.OrderedDict collections.abc.Sequence collections.abc.Callable collections.abc.Iterable collections.abc.Mapping "
+    "dataclasses.dataclass enum.Enum enum.IntEnum enum.IntFlag enum.auto abc.ABC abc.abstractmethod "
+    "collections.abc.Sequence collections.abc.Callable collections.abc.Iterable collections.abc.Mapping "
     "functools.lru_cache functools.cache functools.wraps warnings.catch_warnings warnings.filterwarnings warnings.simplefilter "
     "warnings.warn numbers.Number numbers.Real numbers.Integral "
-    "np.errstate np.printoptions np.seterr np.set_printoptions np.ndarray np.number np.generic np.floating np.integer np.bool_ "
-    "np.linalg np.linalg.LinAlgError np.polynomial np.polynomial.polynomial np.polynomial.chebyshev np.polynomial.legendre "
-    "np.polynomial.hermite np.polynomial.hermite_e np.polynomial.laguerre np.lib np.lib.stride_tricks np.typing "
-    "np.typing.NDArray np.typing.ArrayLike np.finfo np.iinfo np.dtype np.vectorize np.s_ np.index_exp np.isscalar np.fft "
-    "np.ndindex np.issubdtype types.SimpleNamespace".split()
-)
+    "np.errstate np.printoptions np.seterr np.set_printoptions np.ndarray np.number np.generic "
+    "np.linalg.LinAlgError np.polynomial.legendre np.polynomial.hermite np.polynomial.hermite_e np.polynomial.laguerre np.lib "
+    "np.typing.NDArray np.typing.ArrayLike np.s_ np.index_exp".split()
+) | {name for name in MODULES.values() if name.startswith("np.")}
 """Types, modules and decorators that a program may name."""
 
 IGNORED_CALLS = frozenset(
@@ -123,11 +121,12 @@ def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
             return Bound(lambda *args: call_method(runtime, list(owner), name, args, {}))
         case slice() if name in ("start", "stop", "step"):
             return getattr(owner, name)
-        case bool() | int() | float():
-            if name in ("value", "real"):  # of an entry of an Enum
-                return owner
-            if name in ("is_integer", "item"):
-                return Bound(lambda: owner if name == "item" else float(owner).is_integer())
+        case bool() | int() | float() if name in ("value", "real"):  # `value` of an entry of an Enum
+            return owner
+        case bool() | int() | float() if name == "item":
+            return Bound(lambda: owner)
+        case bool() | int() | float() if name == "is_integer":
+            return Bound(lambda: float(owner).is_integer())
         case Function() if name == "__name__":
             return owner.name
         case Masked() if name == "copy":

@@ -1,4 +1,4 @@
-"""Calls and classes: which functions there are, and how the arguments of a call become the names of a function."""
+"""Calls of functions, and classes of a program."""
 
 import ast
 import inspect
@@ -71,7 +71,7 @@ def _call_python(name: str, function: Callable[..., Any], args: Sequence[Any], k
 
 
 def _convert_callables(runtime: Runtime, name: str, args: Sequence[Any]) -> Sequence[Any]:
-    """Return the arguments of a function of NumPy, with functions among them called, or made such that it can call them."""
+    """Return the arguments of a function of NumPy. Functions among them are called now, or become functions of Python."""
     if name == "np.piecewise" and len(args) > 2:
         callables = (Function, Bound, Symbol)
         values = [

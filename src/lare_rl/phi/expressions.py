@@ -11,19 +11,13 @@ from lare_rl.phi.calls import define_function, super_object
 from lare_rl.phi.limits import MAX_INT_BITS, RefusedError
 from lare_rl.phi.numpy_functions import INDEXED, call_numpy
 from lare_rl.phi.operand import Operand
-from lare_rl.phi.runtime import Runtime, check_key, check_number, check_text, make_set
+from lare_rl.phi.runtime import BINARY, Runtime, check_key, check_number, check_text, make_set
 from lare_rl.phi.text import combine_values, format_value
 from lare_rl.phi.values import Class, Function, Instance, Iterator, Scope, Set, Symbol, describe
 
 __all__ = ["apply_binary", "evaluate", "get_item", "list_items", "test_truth"]
 
 NUMBERS = (bool, int, float, complex)
-BINARY: dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]] = {
-    ast.Add: ("add", operator.add), ast.Sub: ("sub", operator.sub), ast.Mult: ("mul", operator.mul),
-    ast.Div: ("truediv", operator.truediv), ast.FloorDiv: ("floordiv", operator.floordiv), ast.Mod: ("mod", operator.mod),
-    ast.Pow: ("pow", operator.pow), ast.BitAnd: ("and", operator.and_), ast.BitOr: ("or", operator.or_),
-    ast.BitXor: ("xor", operator.xor), ast.LShift: ("lshift", operator.lshift), ast.RShift: ("rshift", operator.rshift),
-}  # fmt: skip
 UNARY: dict[type[ast.unaryop], Callable[[Any], Any]] = {
     ast.USub: operator.neg, ast.UAdd: operator.pos, ast.Invert: operator.invert,
 }  # fmt: skip
@@ -50,7 +44,8 @@ def _apply_unary(runtime: Runtime, op: ast.unaryop, value: Any) -> Any:
 def apply_binary(runtime: Runtime, op: ast.operator, x: Any, y: Any) -> Any:
     if isinstance(op, ast.MatMult):
         return call_numpy("matmul", [x, y], {})
-    name, function = BINARY[type(op)]
+    function = BINARY[type(op)]
+    name = function.__name__.rstrip("_")
     for owner, method, other in ((x, f"__{name}__", y), (y, f"__r{name}__", x)):
         if isinstance(owner, Instance) and owner.cls.has(method):
             return runtime.call(runtime.attribute(owner, method), [other], {})

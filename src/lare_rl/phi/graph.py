@@ -91,7 +91,7 @@ class Graph:
 
     @property
     def depth(self) -> int:
-        """Length of the longest chain of operations that need each other's results."""
+        """Length of the longest chain of operations that each need the result of the one before."""
         depths: list[int] = []
         for node in self.nodes:
             depths.append(max((depths[i] for i in node.inputs), default=-1) + 1)

@@ -48,7 +48,7 @@ def factor_meanings(source: str, names: Sequence[str]) -> list[str]:
 
 
 def _parse_or_empty(source: str) -> ast.Module:
-    """Return the syntax tree, which is empty for a text that is not accepted."""
+    """Return the syntax tree of a source, or an empty one if it is refused."""
     try:
         return parse(source)
     except RefusedError:

@@ -174,7 +174,9 @@ def _build_graph(interpreter: Interpreter, observation_size: int, action_size: i
     inputs = {name: builder.input(name, (size,)) for name, size in sizes.items()}
     outputs = []
     for _ in range(2):
-        arrays = [Array(builder.reshape(inputs[name], (1, size)), 0, read_only=True) for name, size in sizes.items()]
+        arrays = [Array(builder.reshape(inputs[name], (1, size)), 0) for name, size in sizes.items()]
+        for array in arrays:
+            array.read_only = True
         outputs.append(_check_factors(interpreter.call(function, arrays, {}), max_factors))
         interpreter.meter, builder.work = Meter(), 0
     if outputs[0] != outputs[1]:

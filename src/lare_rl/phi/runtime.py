@@ -5,6 +5,7 @@ Everything that takes time or memory is paid for before it happens.
 
 import ast
 import functools
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -15,7 +16,7 @@ from lare_rl.phi.limits import MAX_INT_BITS, MAX_KEY_LENGTH, MAX_LIST_LENGTH, MA
 from lare_rl.phi.values import Instance, Scope, Set, Symbol
 
 __all__ = [
-    "BUILTINS", "Meter", "Runtime", "builtin", "builtin_variants", "check_key", "check_number", "check_text",
+    "BINARY", "BUILTINS", "Meter", "Runtime", "builtin", "builtin_variants", "check_key", "check_number", "check_text",
     "check_text_length", "make_set", "varies",
 ]  # fmt: skip
 
@@ -66,7 +67,7 @@ def check_number(value: Any) -> Any:
 
 
 def check_text_length(length: int) -> None:
-    """Raise `RefusedError` if a text of this length, which need not exist yet, is too long."""
+    """Raise `RefusedError` if a text of this length, which is yet to be made, is too long."""
     if length > MAX_TEXT_LENGTH:
         raise RefusedError("E-COST", f"a text is too long: it may have at most {MAX_TEXT_LENGTH} characters")
 
@@ -118,6 +119,13 @@ class Runtime(ABC):
     def attribute(self, owner: Any, name: str, /) -> Any: ...
     @abstractmethod
     def call(self, function: Any, args: Sequence[Any], kwargs: Mapping[str, Any], /) -> Any: ...
+
+
+BINARY: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv, ast.Mod: operator.mod,
+    ast.FloorDiv: operator.floordiv, ast.Pow: operator.pow, ast.BitAnd: operator.and_, ast.BitOr: operator.or_,
+    ast.BitXor: operator.xor, ast.LShift: operator.lshift, ast.RShift: operator.rshift, ast.MatMult: operator.matmul,
+}  # fmt: skip
 
 
 # --- the functions of Python -----------------------------------------------------------------------------------------

@@ -44,7 +44,7 @@ for _op in ELEMENTWISE:
 for _names, _function in {
     "power pow": power,
     "float_power": lambda x, y: power(x * 1.0, y),
-    "square": lambda x: x * x,
+    "square": lambda x: power(x, 2),
     # An integer, such as 1 / 3, is cut to 0.
     "reciprocal": lambda x: elementwise("where", abs(x) == 1, x, 0) if x.kind == "int" else 1.0 / x,
     "positive conj conjugate real": lambda x: x,

@@ -138,7 +138,7 @@ def _correlate(a: Array, v: Array, mode: str, reverse: bool) -> Any:
         a, v = v, a
     n, m = a.row_shape[0], v.row_shape[0]
     short, long = sorted((n, m))
-    windows = FUNCTIONS["sliding_window_view"](FUNCTIONS["pad"](a, m - 1), m)
+    windows = FUNCTIONS["sliding_window_view"](FUNCTIONS["pad"](a, m - 1), [m])
     full = matmul(windows, v[::-1] if reverse else v)
     same = (m - 1) // 2 if n >= m else n // 2  # NumPy swaps the series, and reverses the result
     start, length = {"full": (0, n + m - 1), "same": (same, long), "valid": (short - 1, long - short + 1)}[str(mode)]
@@ -185,7 +185,7 @@ def _vector_norm(x: Array, order: Any, axis: Any, keepdims: Any) -> Any:
 
 
 def _matrix_norm(x: Array, order: Any, axes: tuple[int, ...], keepdims: Any) -> Any:
-    """Frobenius' norm, or the largest sum of magnitudes of a column or of a row."""
+    """Return Frobenius' norm, or the largest or smallest sum of the magnitudes of a column or of a row."""
     if order == "fro":
         return elementwise("sqrt", along("sum", x * x, axes, keepdims))
     if order in (1, -1, math.inf, -math.inf):

@@ -146,7 +146,7 @@ def lexsort(keys: Any, axis: int = -1) -> Array:
 
 @numpy_function()
 def quantile(a: Array, q: Any, axis: Any = None, *, method: Any = "linear", keepdims: Any = False) -> Any:
-    """Between the two entries of the sorted numbers at (n - 1) q; NaN if one of the numbers is NaN."""
+    """Interpolate between the two sorted numbers next to the position (n - 1) q; NaN if one of all numbers is NaN."""
     fractions = require_constant(q, "q of np.quantile")
     axes = a.row_axes(axis)
     rest = [i for i in range(a.ndim) if i not in axes]

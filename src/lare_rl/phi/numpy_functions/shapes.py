@@ -35,7 +35,7 @@ from lare_rl.phi.numpy_functions.registry import (
 
 
 def _register(names: str, convert: Callable[[Any], Any]) -> None:
-    """Register a function that moves the numbers of its first argument. Parameters of NumPy's that move nothing are left out."""
+    """Register a function that moves the numbers of its first argument, without those of its parameters that move nothing."""
     function: Any = functools.reduce(getattr, names.split()[0].split("."), np)
 
     def apply(moved: Any, *args: Any, **kwargs: Any) -> Any:
@@ -124,8 +124,9 @@ def unstack(x: Array, *, axis: int = 0) -> list[Array]:
 
 
 def _with_zeros(function: Callable[..., Any], a: Array, axes: tuple[int, ...], *args: Any) -> Array:
-    """Apply a function that fills with zeros."""
-    a.row_axes(axes)
+    """Apply a function of NumPy that moves numbers along `axes`, and fills with zeros."""
+    a.row_axes(axes)  # refuses the batch axis
+    # Zeros become -1, which `rearrange` takes for a zero.
     return rearrange(lambda positions, *args: function(positions + 1, *args) - 1, a, *args)
 
 
@@ -149,8 +150,8 @@ def roll(a: Array, shift: Any, axis: Any = None) -> Array:
 
 
 @numpy_function()
-def resize(a: Array, new_shape: Any) -> Array:
-    current_builder().check_size(as_sizes(new_shape))
+def resize(a: Array, new_shape: list[int]) -> Array:
+    current_builder().check_size(new_shape)
     return rearrange(np.resize, a, new_shape)
 
 
@@ -202,10 +203,11 @@ def insert(arr: Array, obj: int, values: Array, axis: Any = None) -> Any:
 
 
 @numpy_function("sliding_window_view", "lib.stride_tricks.sliding_window_view")
-def sliding_window_view(x: Array, window_shape: Any, axis: Any = None) -> Array:
-    sizes = as_sizes(window_shape)
-    current_builder().check_size([*x.row_shape, *(max(n, 1) for n in sizes)])
-    return rearrange(lambda positions: np.lib.stride_tricks.sliding_window_view(positions, sizes, axis).copy(), x)
+def sliding_window_view(x: Array, window_shape: list[int], axis: Any = None) -> Array:
+    current_builder().check_size([*x.row_shape, *(max(size, 1) for size in window_shape)])
+    return rearrange(
+        lambda positions: np.lib.stride_tricks.sliding_window_view(positions, window_shape, axis).copy(), x
+    )
 
 
 @numpy_function()

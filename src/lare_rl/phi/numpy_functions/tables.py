@@ -18,7 +18,6 @@ from lare_rl.phi.numpy_functions.registry import (
     array_functions,
     as_float,
     as_numbers,
-    as_sizes,
     find_hint,
     numpy_function,
     numpy_variants,
@@ -111,7 +110,7 @@ def digitize(x: Array, bins: Array, right: Any = False) -> Any:
 
 @numpy_function()
 def interp(x: Array, xp: Array, fp: Array, left: Any = None, right: Any = None, period: Any = None) -> Any:
-    """Straight lines between the points (xp, fp), constant before the first and behind the last."""
+    """Return the value at x of straight lines between the points (xp, fp), constant before the first and behind the last."""
     knots = require_constant(xp, "xp of np.interp").astype(float)
     x = as_numbers(x)
     if period is not None:
@@ -143,14 +142,13 @@ def _interval(x: Array, knots: np.ndarray) -> Any:
 
 
 @numpy_function()
-def unravel_index(indices: Array, shape: Any, order: Any = "C") -> tuple[Any, ...]:
-    sizes = as_sizes(shape)
-    return tuple((indices // stride) % size for stride, size in zip(_strides(sizes, order), sizes, strict=True))
+def unravel_index(indices: Array, shape: list[int], order: Any = "C") -> tuple[Any, ...]:
+    return tuple((indices // stride) % size for stride, size in zip(_strides(shape, order), shape, strict=True))
 
 
 @numpy_function()
-def ravel_multi_index(multi_index: Any, dims: Any, *, order: Any = "C") -> Any:
-    strides = _strides(as_sizes(dims), order)
+def ravel_multi_index(multi_index: Any, dims: list[int], *, order: Any = "C") -> Any:
+    strides = _strides(dims, order)
     return sum(as_array(index) * stride for index, stride in zip(multi_index, strides, strict=True))
 
 

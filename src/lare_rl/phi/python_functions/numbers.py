@@ -13,14 +13,10 @@ from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions import call_numpy
 from lare_rl.phi.operand import Operand
-from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, builtin_variants, check_number, varies
+from lare_rl.phi.runtime import BINARY, BUILTINS, Runtime, builtin, builtin_variants, check_number, varies
 
 SAME_IN_NUMPY = {
     "fabs": "abs", "pow": "power", "atan2": "arctan2", "asin": "arcsin", "acos": "arccos", "atan": "arctan",
-}  # fmt: skip
-OPERATORS: dict[str, type[ast.operator]] = {
-    "add": ast.Add, "sub": ast.Sub, "mul": ast.Mult, "truediv": ast.Div, "floordiv": ast.FloorDiv, "mod": ast.Mod,
-    "pow": ast.Pow, "and_": ast.BitAnd, "or_": ast.BitOr, "xor": ast.BitXor, "matmul": ast.MatMult,
 }  # fmt: skip
 
 
@@ -101,5 +97,5 @@ BUILTINS |= {
         lambda x, y: runtime.binary(ast.Mult(), x, y), runtime.items(values), start
     ),
     "operator.neg": lambda _, x: -x,
-    **{f"operator.{name}": _operator(op) for name, op in OPERATORS.items()},
+    **{f"operator.{function.__name__}": _operator(op) for op, function in BINARY.items()},
 }
