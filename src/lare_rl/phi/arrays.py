@@ -1,12 +1,10 @@
 """The arrays that a program works with: NumPy's shapes, views, indices and writing, on top of a graph of one row.
 
 A program sees a batch: one axis of its arrays has a length that it does not know. In the graph this axis has length 1, or m
-if the program has merged m numbers of a row into it: `x.reshape(batch * m, k)`. All other axes are the same in program and
-graph. An operation that would combine rows is refused: along the batch axis, with an index into it, or on arrays whose batch
-axes do not meet.
+if the program has merged m numbers of a row into it: `x.reshape(batch * m, k)`. Other axes are the same. An operation that
+would combine rows is refused: along the batch axis, with an index into it, or on arrays whose batch axes do not meet.
 
-The numbers of a view are at `positions` of another array, its base. NumPy itself is applied to positions, and tells where the
-numbers of a result come from, and whether it is a view.
+The numbers of a view are at `positions` of another array, its base. NumPy's own functions move positions (rearrange.py).
 """
 
 from __future__ import annotations
@@ -330,11 +328,12 @@ def rearrange(function: Callable[..., Any], arrays: Any, *args: Any) -> Any:
         has_zeros = positions.min() < 0
         if len(inputs) == 1 and not has_zeros:
             return inputs[0].moved(positions, batch_axis)
-        kind = widest([builder.nodes[node].kind for node in nodes])
-        zeros = [builder.cast(builder.constant(0), kind)] if has_zeros else []
+        zeros = [builder.cast(builder.constant(0), widest([builder.nodes[i].kind for i in nodes]))] if has_zeros else []
         return Array(builder.gather(builder.concat([*nodes, *zeros]), positions % (size + 1)), batch_axis)
 
-    return to_array(moved) if isinstance(moved, Source) else type(moved)(map(to_array, moved))
+    if isinstance(moved, Source):
+        return to_array(moved)
+    return (list if isinstance(moved, list) else tuple)(map(to_array, moved))
 
 
 def broadcast(array: Array, shape: Sequence[Any]) -> Array:

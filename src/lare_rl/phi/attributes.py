@@ -11,15 +11,16 @@ import numpy as np
 
 from lare_rl.phi.arrays import Array, Complex, Masked
 from lare_rl.phi.batch_axis import BatchSize
+from lare_rl.phi.calls import class_attribute
 from lare_rl.phi.complex_numbers import call_with_complex
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions import FUNCTIONS, INDEXED, KIND_OF_DTYPE, Polynomial, call_numpy, find_hint
 from lare_rl.phi.python_functions import BUILTINS
 from lare_rl.phi.runtime import Runtime
 from lare_rl.phi.text import METHODS, call_method
-from lare_rl.phi.values import Bound, Function, Symbol, value_type
+from lare_rl.phi.values import Bound, Class, Function, Instance, Symbol, value_type
 
-__all__ = ["IGNORED_CALLS", "get_attribute", "module_attribute", "resolve_import"]
+__all__ = ["get_attribute", "module_attribute", "resolve_import"]
 
 MODULES = {
     "numpy": "np", "numpy.linalg": "np.linalg", "numpy.polynomial": "np.polynomial", "numpy.typing": "np.typing",
@@ -33,20 +34,14 @@ MODULES = {
 """Modules that can be imported. They have only the names below and the functions of `python_functions` and `numpy_functions`."""
 
 NAMES = frozenset(
-    "dataclasses.dataclass enum.Enum enum.IntEnum enum.IntFlag enum.auto abc.ABC abc.abstractmethod "
-    "collections.abc.Sequence collections.abc.Callable collections.abc.Iterable collections.abc.Mapping "
-    "functools.lru_cache functools.cache functools.wraps warnings.catch_warnings warnings.filterwarnings warnings.simplefilter "
-    "warnings.warn numbers.Number numbers.Real numbers.Integral "
-    "np.errstate np.printoptions np.seterr np.set_printoptions np.ndarray np.number np.generic "
+    "dataclasses.dataclass enum.Enum enum.IntEnum enum.IntFlag enum.auto abc.ABC abc.abstractmethod collections.abc.Sequence "
+    "collections.abc.Callable collections.abc.Iterable collections.abc.Mapping functools.lru_cache functools.cache functools.wraps "
+    "warnings.catch_warnings warnings.filterwarnings warnings.simplefilter warnings.warn numbers.Number numbers.Real "
+    "numbers.Integral np.errstate np.printoptions np.seterr np.set_printoptions np.ndarray np.number np.generic "
     "np.linalg.LinAlgError np.polynomial.legendre np.polynomial.hermite np.polynomial.hermite_e np.polynomial.laguerre np.lib "
     "np.typing.NDArray np.typing.ArrayLike np.s_ np.index_exp".split()
 ) | {name for name in MODULES.values() if name.startswith("np.")}
 """Types, modules and decorators that a program may name."""
-
-IGNORED_CALLS = frozenset(
-    "np.seterr np.set_printoptions warnings.filterwarnings warnings.simplefilter warnings.warn functools.wraps".split()
-)
-"""Functions that a program may call and that do nothing."""
 
 CONSTANTS: dict[str, Any] = {
     "np.pi": math.pi, "np.e": math.e, "np.inf": math.inf, "np.nan": math.nan, "np.newaxis": None, "np.euler_gamma": np.euler_gamma,
@@ -91,12 +86,15 @@ def _check_module(name: str) -> None:
 
 
 def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
-    """Return owner.name, for any value but an instance of a class of the program.
+    """Return owner.name.
 
     Raises:
-        RefusedError: this attribute is not available.
+        AttributeError: a class or an object of the program has no attribute of this name.
+        RefusedError: this attribute of another value is not available.
     """
     match owner:
+        case Instance() | Class():
+            return class_attribute(runtime, owner, name)
         case Symbol(module):
             return module_attribute(module, name)
         case Array():

@@ -5,7 +5,6 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from lare_rl.phi.attributes import IGNORED_CALLS
 from lare_rl.phi.complex_numbers import call_with_complex, is_complex
 from lare_rl.phi.limits import MAX_CALL_DEPTH, RefusedError
 from lare_rl.phi.numpy_functions import FUNCTIONS, Polynomial, call_numpy
@@ -27,6 +26,12 @@ from lare_rl.phi.values import (
 __all__ = [
     "call", "class_attribute", "decorate", "define_function", "make_class", "new_instance", "super_object",
 ]  # fmt: skip
+
+
+IGNORED_CALLS = frozenset(
+    "np.seterr np.set_printoptions warnings.filterwarnings warnings.simplefilter warnings.warn functools.wraps".split()
+)
+"""Functions that a program may call and that do nothing."""
 
 
 def call(runtime: Runtime, function: Any, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
@@ -182,9 +187,7 @@ def decorate(runtime: Runtime, value: Any, decorators: Sequence[ast.expr], scope
     for node in reversed(decorators):
         decorator = runtime.evaluate(node.func if isinstance(node, ast.Call) else node, scope)
         name = decorator.name if isinstance(decorator, Symbol) else ""
-        if name in ("staticmethod", "classmethod", "property"):
-            value = Decorated(name, value)
-        elif name == "dataclasses.dataclass" and isinstance(value, Class):
+        if name == "dataclasses.dataclass" and isinstance(value, Class):
             fields = (field for cls in (*reversed(value.bases), value) for field in cls.fields or ())
             value.fields = list(dict.fromkeys(fields))
         elif name not in IGNORED_DECORATORS:

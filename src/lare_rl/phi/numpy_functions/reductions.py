@@ -12,7 +12,7 @@ from lare_rl.phi.arrays import Array, as_array, broadcast, elementwise
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import ELEMENTWISE
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.numpy_functions.registry import FUNCTIONS, as_numbers, numpy_function, numpy_variants
+from lare_rl.phi.numpy_functions.registry import FUNCTIONS, array_functions, as_numbers, numpy_function, numpy_variants
 
 REDUCTIONS: dict[str, tuple[str, Any]] = {
     "sum": ("add", 0), "prod": ("multiply", 1), "max": ("maximum", None), "min": ("minimum", None),
@@ -120,21 +120,18 @@ def moment_without_nan(name: str, a: Array, axis: Any = None, *, keepdims: Any =
     return FUNCTIONS[name](elementwise("where", is_nan, 0, a), axis, keepdims=keepdims, where=~is_nan, **more)
 
 
-@numpy_variants({"argmax": "argmax", "argmin": "argmin"})
-def reduce_to_index(op: str, a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
-    return along(op, a, axis, keepdims)
-
-
-@numpy_function()
-def ptp(a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
-    return elementwise("subtract", along("max", a, axis, keepdims), along("min", a, axis, keepdims))
-
-
-@numpy_function()
-def count_nonzero(a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
-    return along("sum", elementwise("not_equal", a, 0), axis, keepdims)
-
-
+array_functions(
+    {
+        "argmax": lambda a, axis=None, *, keepdims=False: along("argmax", a, axis, keepdims),
+        "argmin": lambda a, axis=None, *, keepdims=False: along("argmin", a, axis, keepdims),
+        "count_nonzero": lambda a, axis=None, *, keepdims=False: along(
+            "sum", elementwise("not_equal", a, 0), axis, keepdims
+        ),
+        "ptp": lambda a, axis=None, *, keepdims=False: elementwise(
+            "subtract", along("max", a, axis, keepdims), along("min", a, axis, keepdims)
+        ),
+    }
+)
 BINARY = [op for op in ELEMENTWISE if getattr(np, op).nin == 2]
 
 
