@@ -156,14 +156,14 @@ def _set_method(runtime: Runtime, values: Set, name: str, args: Sequence[Any]) -
         return Set(values)
     if name == "discard":
         return values.pop(check_key(args[0]), None)
-    others = [make_set([x] if name == "add" else runtime.items(x)) for x in args]
+    sets = [make_set([x] if name == "add" else runtime.items(x)) for x in args]
     if name in ("issubset", "issuperset"):
-        small, large = (values, *others) if name == "issubset" else (*others, values)
+        small, large = (values, *sets) if name == "issubset" else (*sets, values)
         return all(key in large for key in small)
     if name in ("add", "update"):
-        for other in others:
-            runtime.meter.pay_for_list(len(values) + len(other))
-            values.update(other)
+        for entries in sets:
+            runtime.meter.pay_for_list(len(values) + len(entries))
+            values.update(entries)
         return None
     operation = {"union": "or", "intersection": "and", "difference": "sub"}[name]
-    return functools.reduce(lambda x, y: combine_values(runtime.meter, operation, x, y), others, Set(values))
+    return functools.reduce(lambda x, y: combine_values(runtime.meter, operation, x, y), sets, Set(values))
