@@ -39,7 +39,7 @@ def test_rearrangements_of_rearrangements_are_one_gather():
     assert graph.operations[0].option.slices == (slice(4, 5, 1),)
 
 
-@pytest.mark.parametrize("limit", [{"array": 4}, {"operations": 3}, {"chain": 3}, {"work": 999}, {"numbers": 5}])
+@pytest.mark.parametrize("limit", [{"array": 4}, {"operations": 3}, {"depth": 3}, {"work": 999}, {"numbers": 5}])
 def test_limit_is_checked(limit):
     builder = Builder(GraphLimits(**limit))
 

@@ -36,6 +36,8 @@ EXPRESSIONS = """
     len(list(itertools.combinations_with_replacement([1, 2, 3], 2))) | sum(itertools.starmap(pow, [(2, 3), (3, 2)]))
     sorted({1, 2, 3} - {2, 4})[1] | sum({1, 2} & {2, 3}) | sum({1, 2, 3} ^ {3, 4}) | sum({1}.union([2, 3])) | sum({1, 2}.difference([2]))
     functools.reduce(operator.mul, [1, 2, 3, 4]) | operator.itemgetter(1)([5, 6]) | operator.truediv(1, 4) | operator.neg(3)
+    len('a b c'.split(maxsplit=1)) | len({1}.union([2], [3])) | len({1, 2, 3}.difference([1], [2])) | len({1}.union()) | float('.5')
+    sum(f() for f in [lambda: n for n in range(3)]) | sum(a * b for a, b in zip(*[iter([1, 2, 3, 4])] * 2)) | operator.lshift(1, 3)
     collections.OrderedDict([('a', 2)])['a'] | float('%.3f' % 1.23456) | float('{:.1f}'.format(2.25)) | float(f'{1.5:.2f}')
 """
 
@@ -51,3 +53,23 @@ def test_number_is_that_of_python(expressions):
     results = evaluate(graph, inputs, dtype=np.float64)["factors"]
     expected = [float(eval(expression, dict(MODULES))) for expression in expressions]
     np.testing.assert_allclose(results, [expected] * 2, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "statements",
+    [
+        "def f(d):\n    d |= {'a': 1}\nd = {}\nf(d)\nn = len(d)",
+        "def f(s):\n    s |= {1, 2}\ns = set()\nf(s)\nn = len(s)",
+        "def f(x):\n    x *= 2\nx = [1]\nf(x)\nn = len(x)",
+        "def f(x):\n    x += (2, 3)\nx = [1]\nf(x)\nn = len(x)",
+        "try:\n    n = float('one')\nexcept ValueError:\n    n = 7",
+        "from dataclasses import dataclass, field\n@dataclass\nclass A:\n    x: list = field(default_factory=list)\n"
+        "a, b = A(), A()\na.x.append(1)\nn = len(b.x)",
+    ],
+)
+def test_statements_have_their_effect_in_python(statements):
+    names = {}
+    exec(statements, names)
+    graph = read(phi_source(f"{statements}\nreturn [observation[:, :1] * 0 + n]"), 17, 6)
+    inputs = {"observation": np.ones((1, 17)), "action": np.ones((1, 6))}
+    assert evaluate(graph, inputs)["factors"] == names["n"]

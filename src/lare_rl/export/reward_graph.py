@@ -2,12 +2,12 @@
 
     before, after [batch *agents observation]       observations before and after a step
     action [batch *agents action]                   in the environment's units; a choice is a one-hot row
-    length [batch *one]                             T of the step's episode, if the score is a mean over its steps
+    length [batch], or [batch 1] if there are agents    T of the step's episode, if the score is a mean over its steps
     ->  r_hat [batch *agents]
 
-The graph has only the inputs that the method uses, and phi is a part of it: its rows are agents. If credit is assigned by the global state,
-`before` and `after` are states, `action` holds the actions of all agents side by side, and there is one r_hat for the team.
-For `llm-reward`, r_hat is the number that the function returns, in a unit of its own.
+The graph has only the inputs that the method uses. It contains phi, which scores each agent by itself. If credit is assigned by
+the global state, `before` and `after` are states, `action` holds the actions of all agents side by side, and the team has one
+r_hat. For `llm-reward`, r_hat is the number that the function returns, in a unit of its own.
 """
 
 from functools import partial

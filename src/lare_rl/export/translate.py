@@ -1,4 +1,4 @@
-"""Translation of JAX functions to operations of a graph: that of the present `building` block. Shapes are those of one row."""
+"""Translates functions of JAX to operations of a graph, that of the `building` block around the call. Shapes are those of one row."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +10,7 @@ import numpy as np
 from lare_rl.errors import LareError
 from lare_rl.phi.arrays import Array, as_array
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.graph import Graph, NumberKind
+from lare_rl.phi.graph import Graph, NumberKind, all_positions
 from lare_rl.phi.numpy_functions import FUNCTIONS, call_numpy
 from lare_rl.training.numpy_program import Operation, UnsupportedOperationError, apply
 
@@ -59,7 +59,7 @@ def _gather(equation: Any, x: Any, indices: Any) -> Array:
     array, index = as_array(x), as_array(indices).constant
     if index is None:
         raise UnsupportedOperationError("gather at computed positions")
-    positions = jnp.arange(np.prod(array.row_shape)).reshape(array.row_shape)
+    positions = jnp.asarray(all_positions(array.row_shape))
     params = equation.params | {"fill_value": -1}
     moved = np.asarray(equation.primitive.bind(positions, jnp.asarray(index, jnp.int32), **params))
     if (moved < 0).any():

@@ -1,12 +1,10 @@
 """The arrays that a program works with: NumPy's shapes, views, indices and writing, on top of a graph of one row.
 
 A program sees a batch: one axis of its arrays has a length that it does not know. In the graph this axis has length 1, or m
-if the program has merged m numbers of a row into it: `x.reshape(batch * m, k)`. All other axes are the same in program and
-graph. An operation that would combine rows is refused: along the batch axis, with an index into it, or on arrays whose batch
-axes do not meet.
+if the program has merged m numbers of a row into it: `x.reshape(batch * m, k)`. Other axes are the same. An operation that
+would combine rows is refused: along the batch axis, with an index into it, or on arrays whose batch axes do not meet.
 
-The numbers of a view are at `positions` of another array, its base. NumPy itself is applied to positions, to find out where
-slices, transposes, flips or repetitions take their numbers from, and whether the result is a view.
+The numbers of a view are at `positions` of another array, its base. NumPy's own functions move positions (rearrange.py).
 """
 
 from __future__ import annotations
@@ -35,29 +33,25 @@ __all__ = [
 ]  # fmt: skip
 
 
-class _Value(Operand):
+class _ArrayLike(Operand):
     def apply(self, op: str, *operands: Any) -> Any:
         return {"power": power, "invert": invert}.get(op, partial(elementwise, op))(*operands)
 
 
-class Array(_Value):
+class Array(_ArrayLike):
     """An array of a program: a node of the graph, or a view of another array, its base."""
 
+    read_only = False  # True for the inputs
+
     def __init__(
-        self,
-        node: int,
-        batch_axis: int | None,
-        base: Array | None = None,
-        positions: np.ndarray | None = None,
-        read_only: bool = False,
+        self, node: int, batch_axis: int | None, base: Array | None = None, positions: np.ndarray | None = None
     ):
-        self._node, self.batch_axis, self.read_only = node, batch_axis, read_only
+        self._node, self.batch_axis, self.positions = node, batch_axis, positions
         self.base = self if base is None else base
-        self.positions = positions
 
     @property
     def node(self) -> int:
-        """Node of the present numbers."""
+        """Node of the numbers after all writing so far."""
         return self._node if self.positions is None else current_builder().gather(self.base.node, self.positions)
 
     @property
@@ -88,18 +82,19 @@ class Array(_Value):
 
     @property
     def constant(self) -> np.ndarray | None:
-        """Numbers that are the same in all rows; None if they differ, or if the array has a batch axis."""
+        """The numbers, if they are the same in all rows; else, and for an array with a batch axis, None."""
         if self.batch_axis is not None:
             return None
         node = current_builder().nodes[self.node]
         return node.option if node.op == "constant" else None
 
     def number(self) -> Any:
-        """Return the only number of a constant, as a number of Python."""
+        """Return the number of Python that is the only entry of a constant."""
         values = self.constant
         if values is None:
-            text = "a number or condition that differs from row to row: use np.where instead of if"
-            raise RefusedError("E-FLOW", text)
+            raise RefusedError(
+                "E-FLOW", "a number or condition that differs from row to row: use np.where instead of if"
+            )
         if values.size != 1:
             raise ValueError("the truth value of an array with more than one element is ambiguous")
         return values.item()
@@ -152,7 +147,7 @@ class Array(_Value):
         return Source(all_positions(self.row_shape) if self.positions is None else self.positions, self.batch_axis)
 
     def reshaped(self, row_shape: Sequence[int], batch_axis: int | None) -> Array:
-        """Return the array in another shape, whose batch axis is known."""
+        """Return the array in another shape of the graph, with its batch axis there."""
         return self.moved(self.source.positions.reshape(row_shape), batch_axis)
 
     def moved(self, positions: np.ndarray, batch_axis: int | None) -> Array:
@@ -189,45 +184,37 @@ class Array(_Value):
             if isinstance(value, Masked) and value.mask.node == region.mask.node:
                 value = value.values
             elif isinstance(value, Array) and value.batch_axis is not None:
-                text = "x[mask] = y differs from row to row: write x[mask] = y[mask], or np.where(mask, y, x)"
-                raise ValueError(text)
-            value = elementwise("where", region.mask_for(region.values), value, region.values)
-            self[masked_index(self.layout, entries)] = value
+                raise ValueError("x[mask] = y, where y has rows: write x[mask] = y[mask], or np.where(mask, y, x)")
+            mask = region.mask[(..., *(None,) * (region.values.ndim - region.mask.ndim))]
+            self[masked_index(self.layout, entries)] = elementwise("where", mask, value, region.values)
         elif any(isinstance(entry, Array) for entry in entries):
             positions = computed_positions(self.layout, entries, as_array)
             current_builder().check_size((math.prod(positions.row_shape), math.prod(self.row_shape)))
             values = broadcast(as_array(value), positions.shape)
             self[...] = Array(overwrite(self.node, positions.node, values.node), self.batch_axis)
         else:
-            self._write(value, *fixed_index(self.source, entries))
+            base, builder = self.base, current_builder()
+            if base.read_only:
+                raise ValueError("the inputs cannot be written into: copy them first, x = observation.copy()")
+            positions, batch_axis = fixed_index(self.source, entries)
+            values = broadcast(as_array(value), Layout(positions.shape, batch_axis).shape)
+            sources = all_positions(base.row_shape)
+            sources.reshape(-1)[positions.reshape(-1)] = sources.size + np.arange(positions.size)
+            base._node = builder.gather(builder.concat([base._node, builder.cast(values.node, base.kind)]), sources)
 
     def _entries(self, index: Any) -> list[Any]:
         items = index if isinstance(index, tuple) else (index,)
         return index_entries(self.layout, [as_array(x) if isinstance(x, (list, tuple, range)) else x for x in items])
 
-    def _write(self, value: Any, positions: np.ndarray, batch_axis: int | None) -> None:
-        """Write into positions of the base."""
-        base, builder = self.base, current_builder()
-        if base.read_only:
-            raise ValueError("the inputs cannot be written into: copy them first, x = observation.copy()")
-        values = broadcast(as_array(value), Layout(positions.shape, batch_axis).shape)
-        sources = all_positions(base.row_shape)
-        sources.reshape(-1)[positions.reshape(-1)] = sources.size + np.arange(positions.size)
-        base._node = builder.gather(builder.concat([base._node, builder.cast(values.node, base.kind)]), sources)
 
-
-class Masked(_Value):
+class Masked(_ArrayLike):
     """x[mask], where rows differ in what the mask selects. It can be computed with, and written to the same places."""
 
     def __init__(self, values: Array, mask: Array):
-        self.values, self.mask = values, mask
-
-    def mask_for(self, array: Array) -> Any:
-        """Return the mask with as many axes as an array."""
-        return self.mask[(..., *(None,) * (array.ndim - self.mask.ndim))]
+        self.values, self.mask, self.kind = values, mask, values.kind
 
 
-class Complex(_Value):
+class Complex(_ArrayLike):
     """A complex array, as two real ones. `complex_numbers.py` says what can be done with it."""
 
     def __init__(self, real: Any, imag: Any):
@@ -297,9 +284,9 @@ def power(x: Any, exponent: Any) -> Any:
         return elementwise("power", x, exponent)
     if value == 0.5:
         return elementwise("sqrt", x)
-    if isinstance(value, float):
-        x = elementwise("multiply", x, 1.0)
     x = x if isinstance(x, Operand) else as_array(x)
+    if isinstance(value, float) or getattr(x, "kind", None) == "bool":
+        x = elementwise("multiply", x, 1.0 if isinstance(value, float) else 1)
     square = elementwise("multiply", x, x)
     if value <= 2:
         return x if value == 1 else square
@@ -308,10 +295,9 @@ def power(x: Any, exponent: Any) -> Any:
 
 def invert(x: Any) -> Any:
     """Return ~x: not, of truth values; -x - 1, of integers."""
-    kind = (x.values if isinstance(x, Masked) else x).kind
-    if kind == "float":
+    if x.kind == "float":
         raise TypeError("~ of fractional numbers: it acts on conditions, as ~(x > 0)")
-    return elementwise("logical_not", x) if kind == "bool" else elementwise("subtract", -1, x)
+    return elementwise("logical_not", x) if x.kind == "bool" else elementwise("subtract", -1, x)
 
 
 def rearrange(function: Callable[..., Any], arrays: Any, *args: Any) -> Any:
@@ -333,20 +319,17 @@ def rearrange(function: Callable[..., Any], arrays: Any, *args: Any) -> Any:
     else:
         starts, size = itertools.accumulate(sizes, initial=0), sum(sizes)
         nodes = [array.node for array in inputs]
-        sources = [
-            Source(all_positions(x.row_shape) + start, x.batch_axis) for x, start in zip(inputs, starts, strict=False)
-        ]
+        sources = [Source(all_positions(x.row_shape) + i, x.batch_axis) for x, i in zip(inputs, starts, strict=False)]
     remaining = iter(sources)
     moved = move(function, map_leaves(lambda _: next(remaining), arrays), args, size + 1)
 
     def to_array(source: Source) -> Array:
         positions, batch_axis = source
-        if positions.min() >= 0:
-            if len(inputs) == 1:
-                return inputs[0].moved(positions, batch_axis)
-            return Array(builder.gather(builder.concat(nodes), positions), batch_axis)
-        zero = builder.cast(builder.constant(0), widest([builder.nodes[node].kind for node in nodes]))
-        return Array(builder.gather(builder.concat([*nodes, zero]), positions % (size + 1)), batch_axis)
+        has_zeros = positions.min() < 0
+        if len(inputs) == 1 and not has_zeros:
+            return inputs[0].moved(positions, batch_axis)
+        zeros = [builder.cast(builder.constant(0), widest([builder.nodes[i].kind for i in nodes]))] if has_zeros else []
+        return Array(builder.gather(builder.concat([*nodes, *zeros]), positions % (size + 1)), batch_axis)
 
     if isinstance(moved, Source):
         return to_array(moved)

@@ -11,15 +11,16 @@ import numpy as np
 
 from lare_rl.phi.arrays import Array, Complex, Masked
 from lare_rl.phi.batch_axis import BatchSize
+from lare_rl.phi.calls import class_attribute
 from lare_rl.phi.complex_numbers import call_with_complex
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions import FUNCTIONS, INDEXED, KIND_OF_DTYPE, Polynomial, call_numpy, find_hint
 from lare_rl.phi.python_functions import BUILTINS
 from lare_rl.phi.runtime import Runtime
 from lare_rl.phi.text import METHODS, call_method
-from lare_rl.phi.values import Bound, Function, Symbol, value_type
+from lare_rl.phi.values import Bound, Class, Function, Instance, Symbol, value_type
 
-__all__ = ["IGNORED_CALLS", "get_attribute", "module_attribute", "resolve_import"]
+__all__ = ["get_attribute", "module_attribute", "resolve_import"]
 
 MODULES = {
     "numpy": "np", "numpy.linalg": "np.linalg", "numpy.polynomial": "np.polynomial", "numpy.typing": "np.typing",
@@ -33,22 +34,14 @@ MODULES = {
 """Modules that can be imported. They have only the names below and the functions of `python_functions` and `numpy_functions`."""
 
 NAMES = frozenset(
-    "dataclasses.dataclass dataclasses.field enum.Enum enum.IntEnum enum.IntFlag enum.auto abc.ABC abc.abstractmethod "
-    "collections.OrderedDict collections.abc.Sequence collections.abc.Callable collections.abc.Iterable collections.abc.Mapping "
-    "functools.lru_cache functools.cache functools.wraps warnings.catch_warnings warnings.filterwarnings warnings.simplefilter "
-    "warnings.warn numbers.Number numbers.Real numbers.Integral "
-    "np.errstate np.printoptions np.seterr np.set_printoptions np.ndarray np.number np.generic np.floating np.integer np.bool_ "
-    "np.linalg np.linalg.LinAlgError np.polynomial np.polynomial.polynomial np.polynomial.chebyshev np.polynomial.legendre "
-    "np.polynomial.hermite np.polynomial.hermite_e np.polynomial.laguerre np.lib np.lib.stride_tricks np.typing "
-    "np.typing.NDArray np.typing.ArrayLike np.finfo np.iinfo np.dtype np.vectorize np.s_ np.index_exp np.isscalar np.fft "
-    "np.ndindex np.issubdtype types.SimpleNamespace".split()
-)
+    "dataclasses.dataclass enum.Enum enum.IntEnum enum.IntFlag enum.auto abc.ABC abc.abstractmethod collections.abc.Sequence "
+    "collections.abc.Callable collections.abc.Iterable collections.abc.Mapping functools.lru_cache functools.cache functools.wraps "
+    "warnings.catch_warnings warnings.filterwarnings warnings.simplefilter warnings.warn numbers.Number numbers.Real "
+    "numbers.Integral np.errstate np.printoptions np.seterr np.set_printoptions np.ndarray np.number np.generic "
+    "np.linalg.LinAlgError np.polynomial.legendre np.polynomial.hermite np.polynomial.hermite_e np.polynomial.laguerre np.lib "
+    "np.typing.NDArray np.typing.ArrayLike np.s_ np.index_exp".split()
+) | {name for name in MODULES.values() if name.startswith("np.")}
 """Types, modules and decorators that a program may name."""
-
-IGNORED_CALLS = frozenset(
-    "np.seterr np.set_printoptions warnings.filterwarnings warnings.simplefilter warnings.warn functools.wraps".split()
-)
-"""Functions that a program may call and that do nothing."""
 
 CONSTANTS: dict[str, Any] = {
     "np.pi": math.pi, "np.e": math.e, "np.inf": math.inf, "np.nan": math.nan, "np.newaxis": None, "np.euler_gamma": np.euler_gamma,
@@ -93,12 +86,15 @@ def _check_module(name: str) -> None:
 
 
 def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
-    """Return owner.name, for any value but an instance of a class of the program.
+    """Return owner.name.
 
     Raises:
-        RefusedError: this attribute is not available.
+        AttributeError: a class or an object of the program has no attribute of this name.
+        RefusedError: this attribute of another value is not available.
     """
     match owner:
+        case Instance() | Class():
+            return class_attribute(runtime, owner, name)
         case Symbol(module):
             return module_attribute(module, name)
         case Array():
@@ -123,18 +119,21 @@ def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
             return Bound(lambda *args: call_method(runtime, list(owner), name, args, {}))
         case slice() if name in ("start", "stop", "step"):
             return getattr(owner, name)
-        case bool() | int() | float():
-            if name in ("value", "real"):  # of an entry of an Enum
-                return owner
-            if name in ("is_integer", "item"):
-                return Bound(lambda: owner if name == "item" else float(owner).is_integer())
+        case bool() | int() | float() if name in ("value", "real"):  # `value` of an entry of an Enum
+            return owner
+        case bool() | int() | float() if name == "item":
+            return Bound(lambda: owner)
+        case bool() | int() | float() if name == "is_integer":
+            return Bound(lambda: float(owner).is_integer())
         case Function() if name == "__name__":
             return owner.name
-        case Masked() if name in ("clip", "astype", "round", "copy"):
-            return Bound(lambda *args, **kwargs: call_numpy(name, [owner, *args], kwargs) if name != "copy" else owner)
-    if isinstance(owner, Masked):
-        text = f"x[mask].{name[:60]}: rows differ in what a mask selects: use np.where(mask, x, 0)"
-        raise RefusedError("E-ROWS", text)
+        case Masked() if name == "copy":
+            return Bound(lambda: owner)
+        case Masked() if name in ("clip", "round"):
+            return Bound(lambda *args, **kwargs: call_numpy(name, [owner, *args], kwargs))
+        case Masked():
+            text = f"x[mask].{name[:60]}: rows differ in what a mask selects: use np.where(mask, x, 0)"
+            raise RefusedError("E-ROWS", text)
     raise RefusedError("E-ATTRIBUTE", f".{name[:60]} of a {value_type(owner)} is not available")
 
 
@@ -148,7 +147,7 @@ def module_attribute(module: str, name: str) -> Any:
         return Symbol(full)
     if module.startswith("np"):
         short = full.removeprefix("np.")
-        if short in FUNCTIONS or short in INDEXED or short in KIND_OF_DTYPE or f"{short}.outer" in FUNCTIONS:
+        if short in FUNCTIONS or full in INDEXED or short in KIND_OF_DTYPE or f"{short}.outer" in FUNCTIONS:
             return Symbol(full)
         raise RefusedError("E-NUMPY", f"{full[:80]} is not available{_hint(full)}")
     raise RefusedError("E-ATTRIBUTE", f"{full[:80]} is not available{_hint(full)}")
@@ -178,7 +177,7 @@ def _array_attribute(runtime: Runtime, array: Array, name: str) -> Any:
         case "dtype":
             return Symbol({"float": "np.float32", "int": "np.int64", "bool": "np.bool_"}[array.kind])
         case "flat":
-            return list(runtime.items(call_numpy("ravel", [array], {})))
+            return tuple(runtime.items(call_numpy("ravel", [array], {})))  # so that nothing is written into a copy
         case "item":
             return Bound(lambda *index: (array[index] if index else array).number())
         case "tolist":

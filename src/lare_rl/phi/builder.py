@@ -45,7 +45,7 @@ class Builder:
         self.line = 0
         """Line of the source that is being read."""
         self.work = 0
-        self._chains: list[int] = []
+        self._depths: list[int] = []
         self._indices: dict[Any, int] = {}
         self._operations = 0
 
@@ -66,13 +66,13 @@ class Builder:
                 return self.constant(compute(node, [constant.option for constant in nodes], ()))
         key = op, tuple(inputs), shape, kind, option.tobytes() if isinstance(option, np.ndarray) else option
         if key not in self._indices:
-            chain = 1 + max((self._chains[i] for i in inputs), default=-1)
+            depth = 1 + max((self._depths[i] for i in inputs), default=-1)
             self._operations += bool(inputs)
-            if self._operations > self.limits.operations or chain > self.limits.chain:
-                most = f"{self.limits.operations} operations, {self.limits.chain} of them one after the other"
+            if self._operations > self.limits.operations or depth > self.limits.depth:
+                most = f"{self.limits.operations} operations, {self.limits.depth} of them one after the other"
                 raise RefusedError("E-COST", f"the program has too many operations: at most {most}")
             self._indices[key] = len(self.nodes)
-            self._chains.append(chain)
+            self._depths.append(depth)
             self.nodes.append(Node(op, tuple(inputs), shape, kind, option, self.line))
         return self._indices[key]
 

@@ -1,11 +1,10 @@
-"""Calls and classes: which functions there are, and how the arguments of a call become the names of a function."""
+"""Calls of functions, and classes of a program."""
 
 import ast
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from lare_rl.phi.attributes import IGNORED_CALLS
 from lare_rl.phi.complex_numbers import call_with_complex, is_complex
 from lare_rl.phi.limits import MAX_CALL_DEPTH, RefusedError
 from lare_rl.phi.numpy_functions import FUNCTIONS, Polynomial, call_numpy
@@ -27,6 +26,12 @@ from lare_rl.phi.values import (
 __all__ = [
     "call", "class_attribute", "decorate", "define_function", "make_class", "new_instance", "super_object",
 ]  # fmt: skip
+
+
+IGNORED_CALLS = frozenset(
+    "np.seterr np.set_printoptions warnings.filterwarnings warnings.simplefilter warnings.warn functools.wraps".split()
+)
+"""Functions that a program may call and that do nothing."""
 
 
 def call(runtime: Runtime, function: Any, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
@@ -71,7 +76,7 @@ def _call_python(name: str, function: Callable[..., Any], args: Sequence[Any], k
 
 
 def _convert_callables(runtime: Runtime, name: str, args: Sequence[Any]) -> Sequence[Any]:
-    """Return the arguments of a function of NumPy, with functions among them called, or made such that it can call them."""
+    """Return the arguments of a function of NumPy. Functions among them are called now, or become functions of Python."""
     if name == "np.piecewise" and len(args) > 2:
         callables = (Function, Bound, Symbol)
         values = [
@@ -182,9 +187,7 @@ def decorate(runtime: Runtime, value: Any, decorators: Sequence[ast.expr], scope
     for node in reversed(decorators):
         decorator = runtime.evaluate(node.func if isinstance(node, ast.Call) else node, scope)
         name = decorator.name if isinstance(decorator, Symbol) else ""
-        if name in ("staticmethod", "classmethod", "property"):
-            value = Decorated(name, value)
-        elif name == "dataclasses.dataclass" and isinstance(value, Class):
+        if name == "dataclasses.dataclass" and isinstance(value, Class):
             fields = (field for cls in (*reversed(value.bases), value) for field in cls.fields or ())
             value.fields = list(dict.fromkeys(fields))
         elif name not in IGNORED_DECORATORS:
@@ -204,7 +207,9 @@ def new_instance(runtime: Runtime, cls: Class, args: Sequence[Any], kwargs: Mapp
     instance.attributes |= dict(zip(fields, args, strict=False)) | dict(kwargs)
     for name in fields:
         if name not in instance.attributes:
-            instance.attributes[name] = cls.find(name)
+            default = cls.find(name)
+            is_factory = isinstance(default, Decorated) and default.kind == "default_factory"
+            instance.attributes[name] = runtime.call(default.function, [], {}) if is_factory else default
     if cls.has("__post_init__"):
         runtime.call(class_attribute(runtime, instance, "__post_init__"), [], {})
     return instance

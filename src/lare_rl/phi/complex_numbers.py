@@ -97,21 +97,21 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
     "multiply": _multiply,
     "divide": _divide,
     "negative": lambda x: Complex(-x.real, -x.imag),
-    "abs": lambda x: elementwise("hypot", x.real, x.imag),
+    "abs absolute": lambda x: elementwise("hypot", x.real, x.imag),
     "exp": _exp,
     "square": lambda x: _multiply(x, x),
     "real": lambda x: x.real,
     "imag": lambda x: x.imag,
-    "conj": lambda x: Complex(x.real, -x.imag),
+    "conj conjugate": lambda x: Complex(x.real, -x.imag),
     "angle": lambda x: elementwise("arctan2", x.imag, x.real),
     "where": lambda c, x, y: Complex(
         elementwise("where", c.real, x.real, y.real), elementwise("where", c.real, x.imag, y.imag)
     ),
 }
-for _name, _function in _OPERATIONS.items():
-    COMPLEX_OPERATIONS[_name] = lambda *x, f=_function: f(*map(as_complex, x))
+for _names, _function in _OPERATIONS.items():
+    for _name in _names.split():
+        COMPLEX_OPERATIONS[_name] = lambda *x, f=_function: f(*map(as_complex, x))
 COMPLEX_OPERATIONS["power"] = _power
-COMPLEX_OPERATIONS |= {"absolute": COMPLEX_OPERATIONS["abs"], "conjugate": COMPLEX_OPERATIONS["conj"]}
 
 
 array_functions(

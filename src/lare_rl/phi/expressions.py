@@ -11,19 +11,13 @@ from lare_rl.phi.calls import define_function, super_object
 from lare_rl.phi.limits import MAX_INT_BITS, RefusedError
 from lare_rl.phi.numpy_functions import INDEXED, call_numpy
 from lare_rl.phi.operand import Operand
-from lare_rl.phi.runtime import Runtime, check_key, check_number, check_text
+from lare_rl.phi.runtime import BINARY, Runtime, check_key, check_number, check_text, make_set
 from lare_rl.phi.text import combine_values, format_value
 from lare_rl.phi.values import Class, Function, Instance, Iterator, Scope, Set, Symbol, describe
 
 __all__ = ["apply_binary", "evaluate", "get_item", "list_items", "test_truth"]
 
 NUMBERS = (bool, int, float, complex)
-BINARY: dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]] = {
-    ast.Add: ("add", operator.add), ast.Sub: ("sub", operator.sub), ast.Mult: ("mul", operator.mul),
-    ast.Div: ("truediv", operator.truediv), ast.FloorDiv: ("floordiv", operator.floordiv), ast.Mod: ("mod", operator.mod),
-    ast.Pow: ("pow", operator.pow), ast.BitAnd: ("and", operator.and_), ast.BitOr: ("or", operator.or_),
-    ast.BitXor: ("xor", operator.xor), ast.LShift: ("lshift", operator.lshift), ast.RShift: ("rshift", operator.rshift),
-}  # fmt: skip
 UNARY: dict[type[ast.unaryop], Callable[[Any], Any]] = {
     ast.USub: operator.neg, ast.UAdd: operator.pos, ast.Invert: operator.invert,
 }  # fmt: skip
@@ -50,7 +44,8 @@ def _apply_unary(runtime: Runtime, op: ast.unaryop, value: Any) -> Any:
 def apply_binary(runtime: Runtime, op: ast.operator, x: Any, y: Any) -> Any:
     if isinstance(op, ast.MatMult):
         return call_numpy("matmul", [x, y], {})
-    name, function = BINARY[type(op)]
+    function = BINARY[type(op)]
+    name = function.__name__.rstrip("_")
     for owner, method, other in ((x, f"__{name}__", y), (y, f"__r{name}__", x)):
         if isinstance(owner, Instance) and owner.cls.has(method):
             return runtime.call(runtime.attribute(owner, method), [other], {})
@@ -98,8 +93,8 @@ def get_item(runtime: Runtime, container: Any, index: Any) -> Any:
             return runtime.items(container)[index]
         case Instance():
             return runtime.call(runtime.attribute(container, "__getitem__"), [index], {})
-        case Symbol(name) if name.removeprefix("np.") in INDEXED and name.startswith("np."):
-            return INDEXED[name.removeprefix("np.")][index]
+        case Symbol(name) if name in INDEXED:
+            return INDEXED[name][index]
         case Symbol("np.s_" | "np.index_exp"):
             return index
         case Symbol(name) if name in GENERIC_TYPES or name.startswith(("typing.", "np.typing.")):
@@ -163,7 +158,7 @@ def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
         case ast.List(elts=items):
             return _evaluate_entries(runtime, items, scope)
         case ast.Set(elts=items):
-            return Set(dict.fromkeys(map(check_key, _evaluate_entries(runtime, items, scope))))
+            return make_set(_evaluate_entries(runtime, items, scope))
         case ast.Dict(keys=keys, values=values):
             return _evaluate_dict(runtime, keys, values, scope)
         case ast.Compare(first, ops, comparators):
@@ -274,24 +269,24 @@ def _evaluate_comparison(
 def _evaluate_comprehension(
     runtime: Runtime, node: ast.ListComp | ast.GeneratorExp | ast.SetComp | ast.DictComp, scope: Scope
 ) -> Any:
-    turns = _turns(runtime, node.generators, scope)
+    inner = Scope(scope, "comprehension")
+    turns = _turns(runtime, node.generators, scope, inner)
     if isinstance(node, ast.DictComp):
-        return {check_key(runtime.evaluate(node.key, turn)): runtime.evaluate(node.value, turn) for turn in turns}
-    items = [runtime.evaluate(node.elt, turn) for turn in turns]
+        return {check_key(runtime.evaluate(node.key, inner)): runtime.evaluate(node.value, inner) for _ in turns}
+    items = [runtime.evaluate(node.elt, inner) for _ in turns]
     match node:
         case ast.SetComp():
-            return Set(dict.fromkeys(map(check_key, items)))
+            return make_set(items)
         case ast.GeneratorExp():
             return Iterator(items)
     return items
 
 
-def _turns(runtime: Runtime, generators: Sequence[ast.comprehension], scope: Scope) -> Iterable[Scope]:
-    """Yield the scope of each turn of a comprehension."""
-    first, *inner_generators = generators
-    for item in runtime.items(runtime.evaluate(first.iter, scope)):
+def _turns(runtime: Runtime, generators: Sequence[ast.comprehension], outer: Scope, inner: Scope) -> Iterable[None]:
+    """Assign the targets of a comprehension in its scope `inner`, turn by turn. The first iterable is evaluated in `outer`."""
+    first, *remaining = generators
+    for item in runtime.items(runtime.evaluate(first.iter, outer)):
         runtime.meter.pay()
-        inner = Scope(scope, "comprehension")
         runtime.assign(first.target, item, inner)
         if all(runtime.truth(runtime.evaluate(test, inner)) for test in first.ifs):
-            yield from _turns(runtime, inner_generators, inner) if inner_generators else [inner]
+            yield from _turns(runtime, remaining, inner, inner) if remaining else [None]

@@ -1,8 +1,7 @@
 """A function of one row, as a list of typed array operations.
 
 The shapes of a graph do not include the batch, and no operation can reach another row, so rows are independent by
-construction. `evaluate` computes any number of rows by giving every array batch axes in front. `Builder` knows, and limits,
-the kind and the shape of every result before any number is computed.
+construction. `evaluate` computes any number of rows by giving every array batch axes in front.
 
     bool, int, float      the kinds of numbers: bool, int32 and float32 when a graph is computed
     input, constant       arrays of the caller, and arrays that never change
@@ -92,7 +91,7 @@ class Graph:
 
     @property
     def depth(self) -> int:
-        """Length of the longest chain of operations that need each other's results."""
+        """Length of the longest chain of operations that each need the result of the one before."""
         depths: list[int] = []
         for node in self.nodes:
             depths.append(max((depths[i] for i in node.inputs), default=-1) + 1)
@@ -108,7 +107,7 @@ class Graph:
         return entries
 
     def needed_for(self, output: str, number: int) -> dict[int, np.ndarray]:
-        """Return, by the index of each node that the `number`-th entry of an output may depend on, a mask of that node's entries.
+        """Return what the entry `number` of an output may depend on: by the index of a node, a mask of its entries.
 
         An entry that is multiplied by a constant zero counts too.
         """
@@ -126,7 +125,7 @@ class Graph:
 
 
 def _needed_inputs(node: Node, needed: np.ndarray, shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
-    """Return masks of the numbers of an operation's inputs that its needed numbers may depend on."""
+    """Return, for each input of an operation, a mask of the numbers that its needed results may depend on."""
     masks = [np.zeros(shape, bool) for shape in shapes]
     match node.op:
         case "gather":
@@ -215,9 +214,9 @@ _ON_BOOL = {
 def elementwise_kinds(
     op: str, kinds: tuple[NumberKind, ...], negative_exponent: bool = False
 ) -> tuple[str | None, NumberKind, NumberKind]:
-    """Return which operation NumPy applies to operands of these kinds, the kind that they are cast to, and that of the result.
+    """Return what NumPy applies to operands of these kinds, the kind that they are cast to, and the kind of the result.
 
-    The operation is None if nothing is to be done.
+    What it applies is an operation, or None if the result is the operand.
     """
     result, kind = ELEMENTWISE[op], widest(kinds)
     if result == "int":

@@ -1,6 +1,7 @@
 """What an index means: x[:, 1:3], x[:, None], x[np.arange(batch), i].
 
 Fixed indices move positions as NumPy would move numbers. Computed indices become an array of positions, which `take` reads.
+Arrays are recognised by their attributes, because arrays.py imports this file.
 """
 
 from __future__ import annotations

@@ -9,16 +9,12 @@ A program ends soon: the meter counts every step, and numbers, texts, lists and 
 (limits.py).
 """
 
-from typing import Any
-
-from lare_rl.phi import calls, expressions, statements
-from lare_rl.phi.attributes import get_attribute
+from lare_rl.phi import attributes, calls, expressions, statements
 from lare_rl.phi.builder import Builder
-from lare_rl.phi.calls import class_attribute
 from lare_rl.phi.limits import MAX_STEPS
 from lare_rl.phi.python_functions import BUILTINS
 from lare_rl.phi.runtime import Meter, Runtime
-from lare_rl.phi.values import Class, Instance, Scope, Symbol
+from lare_rl.phi.values import Scope, Symbol
 
 __all__ = ["Interpreter"]
 
@@ -36,13 +32,9 @@ class Interpreter(Runtime):
     run = statements.run_statements
     assign = statements.assign
     evaluate = expressions.evaluate
+    attribute = attributes.get_attribute
     call = calls.call
     binary = expressions.apply_binary
     item = expressions.get_item
     items = expressions.list_items
     truth = expressions.test_truth
-
-    def attribute(self, owner: Any, name: str) -> Any:
-        if isinstance(owner, (Instance, Class)):
-            return class_attribute(self, owner, name)
-        return get_attribute(self, owner, name)

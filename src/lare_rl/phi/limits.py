@@ -6,8 +6,6 @@ Each limit is checked before the time or the memory is spent. `Meter` (runtime.p
 
 from dataclasses import dataclass
 
-__all__ = ["DEFAULT_LIMITS", "UNLIMITED", "GraphLimits", "RefusedError"]
-
 # The text
 MAX_SOURCE_LENGTH = 20_000  # characters
 MAX_SYNTAX_DEPTH = 100  # levels of the syntax tree
@@ -47,8 +45,8 @@ class GraphLimits:
     """Numbers of one array, for each row."""
     axes: int = 16
     operations: int = 1000
-    chain: int = 400
-    """Operations that need each other's results."""
+    depth: int = 400
+    """Operations that each need the result of the one before."""
     numbers: int = 1 << 15
     """Numbers of all results of a finished graph together, for each row."""
     work: int = 1 << 21

@@ -33,22 +33,22 @@ def factor_meanings(source: str, names: Sequence[str]) -> list[str]:
     """
     lines = source.split("\n")
     assigned = {line: name for name, line, _ in _assignments(_parse_or_empty(source))}
-    meanings, comment, numbered = {}, "", ""
+    meanings, comment, is_numbered = {}, "", False
     for index, line in enumerate(lines):
-        above = index > 0 and _is_comment(lines[index - 1])
-        if _is_comment(line) and not above:
+        follows_comment = index > 0 and _is_comment(lines[index - 1])
+        if _is_comment(line) and not follows_comment:
             comment = _leading_comment(lines[index:])
-            numbered = comment if NUMBERING.match(comment) else ""
+            is_numbered = NUMBERING.match(comment) is not None
         name = assigned.get(index + 1)
-        if name is not None and (above or (name in names and numbered)):
+        if name is not None and (follows_comment or (name in names and is_numbered)):
             meanings[name] = NUMBERING.sub("", comment)
         if name in names:
-            numbered = ""
+            is_numbered = False
     return [meanings.get(name, "") for name in names]
 
 
 def _parse_or_empty(source: str) -> ast.Module:
-    """Return the syntax tree, which is empty for a text that is not accepted."""
+    """Return the syntax tree of a source, or an empty one if it is refused."""
     try:
         return parse(source)
     except RefusedError:

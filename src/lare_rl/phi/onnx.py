@@ -46,7 +46,7 @@ COMPOSED: dict[str, Callable[..., str]] = {
     "hypot": lambda op, x, y: op("Sqrt", op("Add", op("Mul", x, x), op("Mul", y, y))),
     "left_shift": lambda op, x, y: op("Mul", x, op("Pow", np.array(2), y)),
 }
-"""Operations that are some operations of ONNX. `op` adds one of them."""
+"""Operations that are several operations of ONNX. `op` adds one of these."""
 DTYPES = {"float": np.float32, "int": np.int64, "bool": np.bool_}
 """The types of inputs and outputs."""
 
@@ -58,10 +58,8 @@ def is_onnx_installed() -> bool:
 
 def onnx_model(graph: Graph, name: str) -> Any:
     """Return the ONNX model of a graph, checked by ONNX itself."""
-    import onnx
-    from onnx import helper
-
     writer, values = _Writer(graph), []
+    helper = writer.onnx.helper
     for node in graph.nodes:
         values.append(node.option if node.op == "input" else writer.write(node, [values[i] for i in node.inputs]))
     for output, i in graph.outputs.items():
@@ -70,49 +68,48 @@ def onnx_model(graph: Graph, name: str) -> Any:
         writer.nodes.append(helper.make_node("Identity", [value], [output]))
 
     def describe(nodes: dict[str, Node]) -> list[Any]:
-        dtype = helper.np_dtype_to_tensor_dtype
         return [
-            helper.make_tensor_value_info(key, dtype(np.dtype(DTYPES[node.kind])), (BATCH, *node.shape))
+            helper.make_tensor_value_info(key, writer.tensor_type(node.kind), (BATCH, *node.shape))
             for key, node in nodes.items()
         ]
 
     outputs = {key: graph.nodes[i] for key, i in graph.outputs.items()}
     body = helper.make_graph(writer.nodes, name, describe(graph.inputs), describe(outputs), writer.constants)
     model = helper.make_model(body, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="lare", ir_version=9)
-    onnx.checker.check_model(model)
+    writer.onnx.checker.check_model(model)
     return model
 
 
 class _Writer:
-    """Writes operations, with one batch axis in front of every result that is no constant."""
+    """Collects operations and constants of ONNX. Every result but a constant has one batch axis in front."""
 
     def __init__(self, graph: Graph):
-        self.graph, self.nodes, self.constants = graph, [], []
+        import onnx
+
+        self.onnx, self.graph, self.nodes, self.constants = onnx, graph, [], []
 
     def op(self, name: str, *inputs: Any, results: int = 1, **attributes: Any) -> Any:
         """Add an operation of ONNX. Inputs that are not names become constants."""
-        from onnx import helper
-
         names = [x if isinstance(x, str) else self.constant(x) for x in inputs]
         outputs = [f"value_{len(self.nodes)}_{i}" for i in range(results)]
-        self.nodes.append(helper.make_node(name, names, outputs, **attributes))
+        self.nodes.append(self.onnx.helper.make_node(name, names, outputs, **attributes))
         return outputs[0] if results == 1 else outputs
 
     def constant(self, value: Any) -> str:
-        from onnx import numpy_helper
-
         array, name = np.asarray(value), f"constant_{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(array.astype(DTYPES[KIND_OF_CODE[array.dtype.kind]]), name))
+        typed = array.astype(DTYPES[KIND_OF_CODE[array.dtype.kind]])
+        self.constants.append(self.onnx.numpy_helper.from_array(typed, name))
         return name
 
     def repeat_for_rows(self, constant: str, shape: tuple[int, ...]) -> str:
         rows = self.op("Shape", next(iter(self.graph.inputs)), start=0, end=1)
         return self.op("Expand", constant, self.op("Concat", rows, np.array(shape, int), axis=0))
 
-    def cast(self, x: str, kind: str) -> str:
-        from onnx import helper
+    def tensor_type(self, kind: str) -> int:
+        return self.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(DTYPES[kind]))
 
-        return self.op("Cast", x, to=helper.np_dtype_to_tensor_dtype(np.dtype(DTYPES[kind])))
+    def cast(self, x: str, kind: str) -> str:
+        return self.op("Cast", x, to=self.tensor_type(kind))
 
     def write(self, node: Node, x: list[str]) -> str:
         """Add an operation of the graph, and return the name of its result."""
@@ -136,9 +133,7 @@ class _Writer:
             case "argmax" | "argmin":
                 numbers = self.cast(x[0], "float") if inputs[0].kind == "bool" else x[0]
                 return op({"argmax": "ArgMax", "argmin": "ArgMin"}[node.op], numbers, axis=option, keepdims=0)
-            case "any" | "all":
-                return self.cast(op(REDUCTIONS[node.op], self.cast(x[0], "int"), np.array(option), keepdims=0), "bool")
-            case "sum" | "prod" | "max" | "min":
+            case "sum" | "prod" | "max" | "min" | "any" | "all":
                 numbers = self.cast(x[0], "int") if kind == "bool" else x[0]
                 result = op(REDUCTIONS[node.op], numbers, np.array(option, int), keepdims=0)
                 return self.cast(result, "bool") if kind == "bool" else result

@@ -20,7 +20,7 @@ class Operand:
     __hash__ = object.__hash__
 
     def apply(self, op: str, *operands: Any) -> Any:
-        """Apply an operation on each number, by NumPy's name, to operands. This is one of them."""
+        """Apply an operation on each number, by NumPy's name, to operands, of which this value is one."""
         raise NotImplementedError
 
     def __repr__(self) -> str:

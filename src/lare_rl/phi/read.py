@@ -37,7 +37,7 @@ from lare_rl.phi.values import (
 )
 from lare_rl.util.sanitize import first_invisible
 
-__all__ = ["FUNCTION_NAME", "apply_program", "describe_failure", "parse", "read"]
+__all__ = ["FUNCTION_NAME", "apply_program", "located_refusal", "parse", "read"]
 
 _PARSING = threading.Lock()
 """`threading.stack_size` is for the whole process. Before Python 3.11.8 and 3.12.2, parsers in two threads may also miscount
@@ -88,8 +88,8 @@ def read(source: str, observation_size: int, action_size: int, max_factors: int 
     The program sees arrays (batch, observation_size) and (batch, action_size), and returns a list of arrays (batch, 1).
 
     Raises:
-        RefusedError: the text is no such function. Each line of the message names a rule, a line of the source, what is wrong,
-            and often what to write instead: first what stopped the reader, then further names that are not available.
+        RefusedError: the text is no such function. Each line of the message has a rule, a line of the source, what is wrong,
+            and often what to write instead: the first says what stopped the reader, others name what is not available.
     """
     builder, tree = Builder(), None
     interpreter = Interpreter(builder)
@@ -100,10 +100,9 @@ def read(source: str, observation_size: int, action_size: int, max_factors: int 
             interpreter.run(tree.body, interpreter.module)
             return _build_graph(interpreter, observation_size, action_size, max_factors)
     except Exception as error:  # no text may stop the process that reads it
-        code, message, line = describe_failure(error, interpreter)
-    first = f"{code} line {line}: {' '.join(message[:MAX_MESSAGE_LENGTH].split())}"
+        first = located_refusal(error, interpreter)
     further = [] if tree is None else _unavailable_names(tree, interpreter.module)
-    raise RefusedError(code, "\n".join(dict.fromkeys([first, *further])), line) from None
+    raise RefusedError(first.code, "\n".join(dict.fromkeys([str(first), *further])), first.line)
 
 
 def apply_program(source: str, observation: Array, action: Array) -> Array:
@@ -121,30 +120,32 @@ def apply_program(source: str, observation: Array, action: Array) -> Array:
     return concatenate(factors, 1)
 
 
-def describe_failure(error: Exception, interpreter: Interpreter) -> tuple[str, str, int | None]:
-    """Return the rule, the message and the line of what stopped a program."""
+def located_refusal(error: Exception, interpreter: Interpreter) -> RefusedError:
+    """Return what stopped a program as a refusal. Its message begins with the rule and the line."""
     line = interpreter.line
     match error:
         case RefusedError():
-            return error.code, str(error), error.line or line
+            code, message, line = error.code, str(error), error.line or line
         case _ if isinstance(error, PYTHON_ERRORS):
-            return "E-RUN", error_text(error), line
+            code, message = "E-RUN", _error_text(error)
         case ReturnSignal() | BreakSignal() | ContinueSignal():
-            return "E-SYNTAX", "return outside a function, or break or continue outside a loop", line
+            code, message = "E-SYNTAX", "return outside a function, or break or continue outside a loop"
         case RecursionError() | MemoryError():
-            return "E-COST", "the code is nested too deeply", line
+            code, message = "E-COST", "the code is nested too deeply"
         case _:
-            return "E-BUG", f"an error of LaRe, please report it: {error_text(error)}", line
+            code, message = "E-BUG", f"an error of LaRe, please report it: {_error_text(error)}"
+    refusal = RefusedError(code, " ".join(message[:MAX_MESSAGE_LENGTH].split()), line)
+    return RefusedError(code, refusal.located(line), line)
 
 
-def error_text(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     if isinstance(error, NameError):
         return f"{error} is not defined, or not available"
     return str(error) if isinstance(error, ProgramError) else f"{type(error).__name__}: {error}"
 
 
 def _unavailable_names(tree: ast.Module, module: Scope) -> list[str]:
-    """Return messages about all names of modules in a program that are not available: np.load, np.linalg.svd."""
+    """Return messages about the names in a program that its modules do not have: np.load, np.linalg.svdd."""
     messages = []
     for node in ast.walk(tree):
         if not isinstance(node, ast.Attribute):
@@ -173,7 +174,9 @@ def _build_graph(interpreter: Interpreter, observation_size: int, action_size: i
     inputs = {name: builder.input(name, (size,)) for name, size in sizes.items()}
     outputs = []
     for _ in range(2):
-        arrays = [Array(builder.reshape(inputs[name], (1, size)), 0, read_only=True) for name, size in sizes.items()]
+        arrays = [Array(builder.reshape(inputs[name], (1, size)), 0) for name, size in sizes.items()]
+        for array in arrays:
+            array.read_only = True
         outputs.append(_check_factors(interpreter.call(function, arrays, {}), max_factors))
         interpreter.meter, builder.work = Meter(), 0
     if outputs[0] != outputs[1]:
@@ -186,20 +189,18 @@ def _check_factors(factors: object, max_factors: int) -> list[int]:
     """Return the nodes of the factors that a function has returned."""
     builder = current_builder()
     if not isinstance(factors, (list, tuple)):
-        raise RefusedError("E-FORM", f"{FUNCTION_NAME} must return a list of arrays, not {_describe(factors)}")
+        raise RefusedError("E-FORM", f"{FUNCTION_NAME} must return a list of arrays, not {_describe_shape(factors)}")
     if not 1 <= len(factors) <= max_factors:
         most = "exactly one reward array" if max_factors == 1 else f"1 to {max_factors} factors"
         raise RefusedError("E-FORM", f"{FUNCTION_NAME} must return {most}, not {len(factors)}")
     for number, factor in enumerate(factors, start=1):
         if not isinstance(factor, Array) or factor.batch_axis != 0 or factor.row_shape != (1, 1):
-            is_flat = isinstance(factor, Array) and factor.row_shape == (1,)
-            hint = (
-                ": write observation[:, 8:9] instead of observation[:, 8], or keepdims=True in a sum" if is_flat else ""
-            )
-            text = f"factor {number} must be an array of the shape (batch, 1), not {_describe(factor)}{hint}"
+            text = f"factor {number} must be an array of the shape (batch, 1), not {_describe_shape(factor)}"
+            if isinstance(factor, Array) and factor.row_shape == (1,):
+                text += ": write observation[:, 8:9] instead of observation[:, 8], or keepdims=True in a sum"
             raise RefusedError("E-FORM", text)
     return [builder.reshape(builder.cast(factor.node, "float"), (1,)) for factor in factors]
 
 
-def _describe(value: object) -> str:
+def _describe_shape(value: object) -> str:
     return f"of the shape {value.shape}" if isinstance(value, Array) else describe(value)

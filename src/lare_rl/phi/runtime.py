@@ -1,10 +1,11 @@
-"""What functions of a program need of the interpreter, which they take first, and what a program may spend.
+"""The interface of the interpreter, which the functions of Python take as their first argument; and what a program may spend.
 
 Everything that takes time or memory is paid for before it happens.
 """
 
 import ast
 import functools
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -12,9 +13,12 @@ from typing import Any
 from lare_rl.phi.arrays import Array
 from lare_rl.phi.builder import Builder
 from lare_rl.phi.limits import MAX_INT_BITS, MAX_KEY_LENGTH, MAX_LIST_LENGTH, MAX_STEPS, MAX_TEXT_LENGTH, RefusedError
-from lare_rl.phi.values import Instance, Scope, Symbol
+from lare_rl.phi.values import Instance, Scope, Set, Symbol
 
-__all__ = ["Meter", "Runtime", "builtin", "check_key", "check_number", "check_text", "check_text_length", "varies"]
+__all__ = [
+    "BINARY", "BUILTINS", "Meter", "Runtime", "builtin", "builtin_variants", "check_key", "check_number", "check_text",
+    "check_text_length", "make_set", "varies",
+]  # fmt: skip
 
 
 class Meter:
@@ -37,7 +41,7 @@ class Meter:
         return values
 
     def pay_for_all_within(self, values: Iterable[Any]) -> None:
-        """Pay for values and all that they contain. A list that holds another one twice, and so on, has very many entries."""
+        """Pay for values and all that they contain: a list of two lists of two lists ... has very many entries."""
         stack = list(values)
         while stack:
             value = stack.pop()
@@ -63,7 +67,7 @@ def check_number(value: Any) -> Any:
 
 
 def check_text_length(length: int) -> None:
-    """Raise `RefusedError` if a text of this length, which need not exist yet, is too long."""
+    """Raise `RefusedError` if a text of this length, which is yet to be made, is too long."""
     if length > MAX_TEXT_LENGTH:
         raise RefusedError("E-COST", f"a text is too long: it may have at most {MAX_TEXT_LENGTH} characters")
 
@@ -83,14 +87,18 @@ def check_key(value: Any) -> Any:
     return value
 
 
+def make_set(values: Iterable[Any]) -> Set:
+    return Set(dict.fromkeys(map(check_key, values)))
+
+
 class Runtime(ABC):
-    """A program that is carried out. `Interpreter` says where each method is defined."""
+    """A program that is being carried out. `Interpreter` says where each method is defined."""
 
     builder: Builder
     meter: Meter
     module: Scope
     line: int
-    """Line that is being carried out."""
+    """Line of the present statement."""
     call_depth: int
 
     @abstractmethod
@@ -113,11 +121,18 @@ class Runtime(ABC):
     def call(self, function: Any, args: Sequence[Any], kwargs: Mapping[str, Any], /) -> Any: ...
 
 
+BINARY: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv, ast.Mod: operator.mod,
+    ast.FloorDiv: operator.floordiv, ast.Pow: operator.pow, ast.BitAnd: operator.and_, ast.BitOr: operator.or_,
+    ast.BitXor: operator.xor, ast.LShift: operator.lshift, ast.RShift: operator.rshift, ast.MatMult: operator.matmul,
+}  # fmt: skip
+
+
 # --- the functions of Python -----------------------------------------------------------------------------------------
 
 
 BUILTINS: dict[str, Callable[..., Any]] = {}
-"""All functions, by names such as "len", "math.sqrt", "itertools.product"."""
+"""Functions of Python, by names such as "len", "math.sqrt", "itertools.product"."""
 
 
 def builtin(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -131,7 +146,7 @@ def builtin(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
 
 def builtin_variants(table: Mapping[str, Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Register one function for each row of a table: a name, and the value that it takes before the runtime."""
+    """Register a function under each name of a table, whose value it takes before the runtime."""
 
     def register(function: Callable[..., Any]) -> Callable[..., Any]:
         BUILTINS.update({name: functools.partial(function, variant) for name, variant in table.items()})

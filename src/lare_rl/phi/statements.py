@@ -161,7 +161,7 @@ def _set_item(runtime: Runtime, container: Any, index: Any, value: Any) -> None:
 
 
 def _augment(runtime: Runtime, statement: ast.AugAssign, scope: Scope) -> None:
-    """Carry out `x += y`. As in NumPy, an array is changed in place, and so are its views."""
+    """Carry out `x += y`. A list, a dictionary, a set, and an array with its views are changed in place."""
     target, container, index = statement.target, None, None
     if isinstance(target, ast.Subscript):
         container, index = runtime.evaluate(target.value, scope), runtime.evaluate(target.slice, scope)
@@ -170,12 +170,14 @@ def _augment(runtime: Runtime, statement: ast.AugAssign, scope: Scope) -> None:
         old = runtime.evaluate(target, scope)
     operand = runtime.evaluate(statement.value, scope)
     if isinstance(old, list) and isinstance(statement.op, ast.Add):
-        items = list(runtime.items(operand))
-        runtime.meter.pay_for_list(len(old) + len(items))
-        old.extend(items)
-        return
+        operand = list(runtime.items(operand))
     new = runtime.binary(statement.op, old, operand)
-    if isinstance(target, ast.Subscript):
+    if type(old) is type(new) is list:
+        old[:] = new
+    elif isinstance(old, dict) and type(old) is type(new):
+        old.clear()
+        old.update(new)
+    elif isinstance(target, ast.Subscript):
         _set_item(runtime, container, index, new)
     elif isinstance(old, Array) and old.ndim:
         if isinstance(new, Array) and new.kind == "float" != old.kind:

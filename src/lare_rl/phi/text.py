@@ -1,5 +1,6 @@
 """Texts, lists, dictionaries and sets of a program: their operators, their methods, and the texts of values."""
 
+import functools
 import operator
 import re
 import string
@@ -10,7 +11,7 @@ from lare_rl.phi.arrays import Array
 from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import Operand
-from lare_rl.phi.runtime import Meter, Runtime, check_key, check_text, check_text_length
+from lare_rl.phi.runtime import Meter, Runtime, check_key, check_text, check_text_length, make_set
 from lare_rl.phi.values import Set, Symbol, value_type
 
 __all__ = ["METHODS", "call_method", "combine_values", "format_value"]
@@ -32,7 +33,7 @@ METHODS: dict[type, frozenset[str]] = {
 
 
 def format_value(meter: Meter, value: Any, spec: str) -> str:
-    """Return the text of a value. The numbers of an array are not known yet, unless it is constant."""
+    """Return the text of a value: "<array>" for an array, unless it is constant."""
     if isinstance(value, Array) and value.constant is not None and not spec:
         value = value.constant.tolist()
     if isinstance(value, Operand):
@@ -47,7 +48,7 @@ def format_value(meter: Meter, value: Any, spec: str) -> str:
 
 
 def _text_length(value: Any) -> int:
-    """Return about how long the text of a value is."""
+    """Return an estimate of the length of a value's text."""
     if isinstance(value, (list, tuple)):
         return sum(map(_text_length, value))
     return 4 * len(value) if isinstance(value, str) else 4
@@ -85,7 +86,7 @@ def combine_values(meter: Meter, name: str, x: Any, y: Any) -> Any:
 
 
 def call_method(runtime: Runtime, owner: Any, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
-    """Call a method of a text, list, dictionary or set that is in `METHODS`."""
+    """Call a method that `METHODS` lists."""
     runtime.meter.pay(len(owner) + 1)
     if isinstance(owner, str):
         return _text_method(runtime, owner, name, args, kwargs)
@@ -101,14 +102,14 @@ def _text_method(runtime: Runtime, text: str, name: str, args: Sequence[Any], kw
         return _format_fields(runtime, text, args, kwargs)
     length = 0
     if name == "join":
-        args = [[item for item in runtime.items(args[0]) if isinstance(item, str)]]
-        length = sum(map(len, args[0])) + len(text) * len(args[0])
+        args = [runtime.items(args[0])]
+        length = sum(len(item) for item in args[0] if isinstance(item, str)) + len(text) * len(args[0])
     elif name == "replace":
         length = (text.count(args[0]) if args[0] else len(text) + 1) * len(args[1])
     elif name == "zfill":
         length = operator.index(args[0])
     check_text_length(length)
-    return getattr(str, name)(text, *args)
+    return getattr(str, name)(text, *args, **kwargs)
 
 
 def _format_fields(runtime: Runtime, text: str, args: Sequence[Any], kwargs: dict[str, Any]) -> str:
@@ -130,12 +131,11 @@ def _list_method(runtime: Runtime, values: list[Any], name: str, args: Sequence[
         return None
     if name == "extend":
         args = [list(runtime.items(args[0]))]
-    added = len(args[0]) if name == "extend" else name in ("append", "insert")
-    if added:
-        runtime.meter.pay_for_list(len(values) + added)
+    if name in ("append", "extend", "insert"):
+        runtime.meter.pay_for_list(len(values) + (len(args[0]) if name == "extend" else 1))
     if name in ("index", "count", "remove"):
         runtime.meter.pay_for_all_within(values)
-    return getattr(list, name)(values, *args)
+    return getattr(list, name)(values, *args, **kwargs)
 
 
 def _dict_method(
@@ -147,7 +147,7 @@ def _dict_method(
         values |= runtime.call(Symbol("dict"), args, kwargs)
         runtime.meter.pay_for_list(len(values))
         return None
-    result = getattr(dict, name)(values, *args)
+    result = getattr(dict, name)(values, *args, **kwargs)
     return list(result) if name in ("items", "keys", "values") else result
 
 
@@ -156,12 +156,14 @@ def _set_method(runtime: Runtime, values: Set, name: str, args: Sequence[Any]) -
         return Set(values)
     if name == "discard":
         return values.pop(check_key(args[0]), None)
-    other = Set(dict.fromkeys(map(check_key, [args[0]] if name == "add" else runtime.items(args[0]))))
-    if name in ("add", "update"):
-        runtime.meter.pay_for_list(len(values) + len(other))
-        return values.update(other)
+    sets = [make_set([x] if name == "add" else runtime.items(x)) for x in args]
     if name in ("issubset", "issuperset"):
-        small, large = (values, other) if name == "issubset" else (other, values)
+        small, large = (values, *sets) if name == "issubset" else (*sets, values)
         return all(key in large for key in small)
+    if name in ("add", "update"):
+        for entries in sets:
+            runtime.meter.pay_for_list(len(values) + len(entries))
+            values.update(entries)
+        return None
     operation = {"union": "or", "intersection": "and", "difference": "sub"}[name]
-    return combine_values(runtime.meter, operation, values, other)
+    return functools.reduce(lambda x, y: combine_values(runtime.meter, operation, x, y), sets, Set(values))

@@ -1,10 +1,11 @@
-"""Reads a phi over turns: a program that looks at one call of a tool, and names what happened.
+"""Reads a phi over turns: a program that looks at one call of a tool, and returns what happened as named numbers, the events.
 
     def turn_events(tool, arguments, result, text):
         return {"tests pass": tool == "test" and "passed" in result.lower()}
 
-The language is that of `read.py`, without arrays. `tool`, `result` and `text` are texts, and `arguments` is a dictionary. In addition,
-`find_numbers(text)` returns the numbers in a text. The program is carried out anew for each call, so that it can keep nothing.
+The language is that of `read.py`, without arrays and with `find_numbers(text)`, which returns the numbers in a text. `tool`,
+`result` and `text` are texts, and `arguments` is a dictionary. The program is carried out anew for each call, so that it can
+keep nothing.
 """
 
 import ast
@@ -16,8 +17,8 @@ from typing import Any
 
 from lare_rl.phi.builder import Builder, building
 from lare_rl.phi.interpreter import Interpreter
-from lare_rl.phi.limits import MAX_FACTORS, MAX_INT_BITS, MAX_MESSAGE_LENGTH, MAX_TEXT_LENGTH, RefusedError
-from lare_rl.phi.read import describe_failure, parse
+from lare_rl.phi.limits import MAX_FACTORS, MAX_INT_BITS, MAX_TEXT_LENGTH, RefusedError
+from lare_rl.phi.read import located_refusal, parse
 from lare_rl.phi.runtime import Meter
 from lare_rl.phi.values import Bound, Function, describe
 from lare_rl.util.sanitize import one_line
@@ -26,18 +27,14 @@ __all__ = ["TURN_FUNCTION_NAME", "TurnProgram", "read_turn_program", "shorten"]
 
 TURN_FUNCTION_NAME = "turn_events"
 """The name of the function that a program must define."""
-MAX_STEPS = 150_000
-"""Steps for one call. A method of a text takes a step for each of its characters."""
-MAX_NAME = 60
-"""Characters of the name of an event."""
-MAX_EVENT = 1e6
-"""The largest number of an event."""
-MAX_ARGUMENTS = 100
-"""Entries of the arguments, and of each list or dictionary within them."""
+MAX_STEPS = 150_000  # for one call; a method of a text takes a step for each of its characters
+MAX_NAME_LENGTH = 60  # of an event
+MAX_EVENT = 1e6  # the largest number of an event
+MAX_ARGUMENTS = 100  # entries of the arguments, and of each list or dictionary within them
 MAX_ARGUMENT_DEPTH = 4
-MAX_NUMBERS = 1000
-MAX_NUMBER = 1e300
-CUT = "\n... (the middle of a long text is left out) ...\n"
+MAX_NUMBERS = 1000  # that find_numbers returns
+MAX_NUMBER = 1e300  # in the arguments; larger ones become this one
+OMISSION = "\n... (the middle of a long text is left out) ...\n"
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d{1,300}(?:\.\d{1,300})?(?!\d)")
 
 
@@ -66,12 +63,12 @@ class TurnProgram:
                 interpreter.run(self.tree.body, interpreter.module)
                 function = interpreter.module.get(TURN_FUNCTION_NAME)
                 if not isinstance(function, Function):
-                    form = f"{TURN_FUNCTION_NAME}(tool, arguments, result, text)"
-                    raise RefusedError("E-FORM", f"there is no function {form}")
+                    signature = f"{TURN_FUNCTION_NAME}(tool, arguments, result, text)"
+                    raise RefusedError("E-FORM", f"there is no function {signature}")
                 return _check_events(interpreter.call(function, inputs, {}))
             except Exception as error:  # no text may stop the process that reads it
-                code, message, line = describe_failure(error, interpreter)
-        raise RefusedError(code, f"{code} line {line}: {' '.join(message[:MAX_MESSAGE_LENGTH].split())}", line)
+                refusal = located_refusal(error, interpreter)
+        raise refusal
 
 
 def read_turn_program(source: str) -> TurnProgram:
@@ -87,11 +84,11 @@ def read_turn_program(source: str) -> TurnProgram:
 
 
 def shorten(text: str, length: int = MAX_TEXT_LENGTH) -> str:
-    """Return a text whose middle is left out if it is longer than a program may read."""
+    """Return a text, without its middle if it is longer than a program may read."""
     if len(text) <= length:
         return text
-    half = (length - len(CUT)) // 2
-    return text[:half] + CUT + text[len(text) - half :]
+    half = (length - len(OMISSION)) // 2
+    return text[:half] + OMISSION + text[len(text) - half :]
 
 
 def _copy_argument(value: Any, depth: int = 0) -> Any:
@@ -108,14 +105,14 @@ def _copy_argument(value: Any, depth: int = 0) -> Any:
         return "..."
     if isinstance(value, Mapping):
         entries = list(value.items())[:MAX_ARGUMENTS]
-        return {shorten(str(key), MAX_NAME * 4): _copy_argument(item, depth + 1) for key, item in entries}
+        return {shorten(str(key), MAX_NAME_LENGTH * 4): _copy_argument(item, depth + 1) for key, item in entries}
     if isinstance(value, list | tuple):
         return [_copy_argument(item, depth + 1) for item in value[:MAX_ARGUMENTS]]
     return "..."
 
 
 def _find_numbers(meter: Meter, text: Any) -> list[float]:
-    """Return the numbers in a text, in their order: 3, -1.5, +7, and the 20 of 20%. Digits after a letter are none."""
+    """Return the numbers in a text, in their order: 3, -1.5, +7, and the 20 of 20%; but not the 3 of v3."""
     if not isinstance(text, str):
         raise TypeError(f"find_numbers takes a text, not {describe(text)}")
     meter.pay(len(text))
@@ -130,8 +127,8 @@ def _check_events(events: Any) -> dict[str, float]:
         raise RefusedError("E-FORM", f"{TURN_FUNCTION_NAME} must return 1 to {MAX_FACTORS} events, not {len(events)}")
     result = {}
     for name, value in events.items():
-        if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or name != one_line(name):
-            text = f"the name of an event must be a text of 1 to {MAX_NAME} characters, in one line"
+        if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME_LENGTH or name != one_line(name):
+            text = f"the name of an event must be a text of 1 to {MAX_NAME_LENGTH} characters, in one line"
             raise RefusedError("E-FORM", text)
         if not isinstance(value, bool | int | float):
             raise RefusedError("E-FORM", f"the event {name!r} must be a number or a truth value, not {describe(value)}")

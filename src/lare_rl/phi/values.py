@@ -52,7 +52,7 @@ class Bound(_Value):
 
 @dataclass(eq=False, repr=False)
 class Decorated(_Value):
-    """A static method, a class method or a property."""
+    """A static method, a class method, a property, or the `default_factory` of a dataclass's field."""
 
     kind: str
     function: Any
@@ -97,7 +97,7 @@ class Iterator(list):
 
 
 class Scope(dict):
-    """The names of a call, of a class or of a comprehension. Names that are not in it are searched in the scopes around it."""
+    """The names of a module, a call, a class or a comprehension. Other names are searched in the scopes around it."""
 
     def __init__(self, parent: Scope | None = None, kind: str = "function"):
         super().__init__()
@@ -105,7 +105,7 @@ class Scope(dict):
         self.elsewhere: dict[str, Scope] = {}
         """The scopes of names that are declared global or nonlocal."""
         self.yielded: list[Any] | None = None
-        """What a generator has yielded."""
+        """What a generator has yielded so far; None in other functions."""
         self.owner: Class | None = None
         """The class whose method is called."""
         self.instance: Any = None
@@ -132,7 +132,7 @@ class Scope(dict):
 
     @property
     def closure(self) -> Scope:
-        """The scope that functions see which are defined here. They do not see that of a class."""
+        """The scope around the functions that are defined here. A method does not see the names of its class."""
         return self.parent if self.kind == "class" and self.parent is not None else self
 
 

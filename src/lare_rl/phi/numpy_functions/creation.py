@@ -18,7 +18,6 @@ from lare_rl.phi.numpy_functions.registry import (
     array_functions,
     as_float,
     as_list,
-    as_sizes,
     astype,
     dtype_kind,
     numpy_function,
@@ -78,11 +77,17 @@ def arange(start: Any, stop: Any = None, step: Any = 1, dtype: Any = None) -> Ar
 
 
 @numpy_variants({"linspace": np.linspace, "logspace": np.logspace, "geomspace": np.geomspace})
-def series(
-    function: Any, start: float, stop: float, num: int = 50, endpoint: Any = True, base: float = 10.0, dtype: Any = None
+def spaced_numbers(
+    function: Any,
+    start: float,
+    stop: float,
+    num: int = 50,
+    endpoint: Any = True,
+    base: float | None = None,
+    dtype: Any = None,
 ) -> Array:
     current_builder().check_size([num])
-    more = {"base": base} if function is np.logspace else {}
+    more = {} if base is None else {"base": base}
     return as_array(function(start, stop, num, bool(endpoint), dtype=dtype_kind(dtype or "float"), **more))
 
 
@@ -94,25 +99,24 @@ def unit_matrix(function: Any, N: int, M: int | None = None, k: int = 0, dtype: 
 
 
 @numpy_function()
-def fromfunction(function: Callable[..., Any], shape: Any, *, dtype: Any = "float") -> Any:
-    sizes = as_sizes(shape)
-    current_builder().check_size([*sizes, len(sizes) or 1])
-    return function(*(astype(grid, dtype) for grid in np.indices(sizes)))
+def fromfunction(function: Callable[..., Any], shape: list[int], *, dtype: Any = "float") -> Any:
+    current_builder().check_size([*shape, len(shape) or 1])
+    return function(*(astype(grid, dtype) for grid in np.indices(shape)))
 
 
 @numpy_function()
 def apply_along_axis(func1d: Callable[..., Any], axis: int, arr: Array, *args: Any, **kwargs: Any) -> Any:
-    """Apply a function to each series along the last axis. It is called once for all rows, for each entry of the other axes."""
+    """Apply a function to each series along the last axis. It is called once for each entry of the other axes of a row."""
     (at,) = arr.row_axes(axis)
     if at != arr.ndim - 1:
         raise RefusedError("E-NUMPY", "np.apply_along_axis works along the last axis: use axis=-1")
-    in_row = Array(arr.node, None).reshaped((-1, arr.row_shape[at]), None)  # arrays of one row, without a batch axis
-    results = stack([as_array(func1d(values, *args, **kwargs)) for values in in_row], 0)
+    series_of_row = Array(arr.node, None).reshaped((-1, arr.row_shape[at]), None)
+    results = stack([as_array(func1d(series, *args, **kwargs)) for series in series_of_row], 0)
     return results.reshaped((*arr.row_shape[:-1], *results.row_shape[1:]), arr.batch_axis)
 
 
 class Indexed:
-    """An object of NumPy that makes an array of an index. Slices stand for ranges. A grid of a single slice is its range."""
+    """An object of NumPy that makes an array of an index. Slices mean ranges. A grid of a single slice is its range."""
 
     def __init__(self, join: Callable[[list[Array]], Any], *, is_grid: bool = False):
         self.join, self.is_grid = join, is_grid
@@ -131,19 +135,18 @@ def _read_range(item: Any) -> Array:
 
 
 INDEXED = {
-    "r_": Indexed(lambda items: rearrange(lambda arrays: np.r_[tuple(arrays)], items)),
-    "c_": Indexed(lambda items: rearrange(lambda arrays: np.c_[tuple(arrays)], items)),
-    "mgrid": Indexed(lambda ranges: stack(meshgrid(*ranges, indexing="ij"), 0), is_grid=True),
-    "ogrid": Indexed(lambda ranges: meshgrid(*ranges, indexing="ij", sparse=True), is_grid=True),
+    "np.r_": Indexed(lambda items: rearrange(lambda arrays: np.r_[tuple(arrays)], items)),
+    "np.c_": Indexed(lambda items: rearrange(lambda arrays: np.c_[tuple(arrays)], items)),
+    "np.mgrid": Indexed(lambda ranges: stack(meshgrid(*ranges, indexing="ij"), 0), is_grid=True),
+    "np.ogrid": Indexed(lambda ranges: meshgrid(*ranges, indexing="ij", sparse=True), is_grid=True),
 }
 """Objects of NumPy that are used with an index."""
 
 
 @numpy_function()
-def indices(dimensions: Any, dtype: Any = "int") -> Array:
-    sizes = as_sizes(dimensions)
-    current_builder().check_size([*sizes, len(sizes)])
-    return astype(np.indices(sizes), dtype)
+def indices(dimensions: list[int], dtype: Any = "int") -> Array:
+    current_builder().check_size([*dimensions, len(dimensions)])
+    return astype(np.indices(dimensions), dtype)
 
 
 def _as_indices(a: Array) -> Array:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import Array, as_array, concatenate, elementwise, invert, power
+from lare_rl.phi.arrays import Array, concatenate, elementwise, invert, power
 from lare_rl.phi.graph import ELEMENTWISE
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.numpy_functions.registry import UFUNCS, as_numbers, as_operand, call_numpy, numpy_function
+from lare_rl.phi.numpy_functions.registry import UFUNCS, as_numbers, as_operand, astype, call_numpy, numpy_function
 from lare_rl.phi.operand import Operand
 
-UNARY = frozenset(
-    "sqrt exp log log1p expm1 exp2 log2 log10 cbrt sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh arccosh arctanh abs "
-    "negative sign floor ceil trunc rint isnan isinf isfinite signbit logical_not".split()
-)
 ALIASES = {
     "abs": "absolute fabs", "remainder": "mod", "divide": "true_divide", "trunc": "fix", "arccos": "acos", "arcsin": "asin",
     "arctan": "atan", "arctan2": "atan2", "arccosh": "acosh", "arcsinh": "asinh", "arctanh": "atanh",
@@ -26,34 +24,29 @@ ALIASES = {
 MAX_FLOAT32 = float(np.finfo(np.float32).max)
 
 
-def _register_ufunc(op: str, function: Callable[..., Any]) -> None:
+def _register_ufunc(names: str, function: Callable[..., Any], n_inputs: int) -> None:
+    """Register a function on each number under NumPy's names, separated by spaces. `call_numpy` handles its `where=`."""
+
     def unary(x: Operand, /, *, where: Any = True) -> Any:
         return function(x)
 
     def binary(x1: Operand, x2: Operand, /, *, where: Any = True) -> Any:
         return function(x1, x2)
 
-    names = [op, *ALIASES.get(op, "").split()]
-    numpy_function(*names)(unary if op in UNARY else binary)
-    UFUNCS.update(names)
+    numpy_function(*names.split())(unary if n_inputs == 1 else binary)
+    UFUNCS.update(names.split())
 
 
 for _op in ELEMENTWISE:
-    _register_ufunc(_op, lambda *x, op=_op: elementwise(op, *x))
+    _register_ufunc(f"{_op} {ALIASES.get(_op, '')}", partial(elementwise, _op), getattr(np, _op).nin)
 
 
-def _nonzero(x: Operand) -> Any:
-    """Replace 0 by 1."""
-    return elementwise("where", x == 0, 1.0, x)
-
-
-UNARY |= {"square", "reciprocal", "positive", "degrees", "radians", "rad2deg", "deg2rad", "bitwise_not", "invert", "isneginf",
-          "isposinf", "conj", "conjugate", "real", "bitwise_invert", "modf", "sinc"}  # fmt: skip
 for _names, _function in {
     "power pow": power,
     "float_power": lambda x, y: power(x * 1.0, y),
-    "square": lambda x: x * x,
-    "reciprocal": lambda x: 1.0 / x,
+    "square": lambda x: power(x, 2),
+    # An integer, such as 1 / 3, is cut to 0.
+    "reciprocal": lambda x: elementwise("where", abs(x) == 1, x, 0) if x.kind == "int" else 1.0 / x,
     "positive conj conjugate real": lambda x: x,
     "degrees rad2deg": lambda x: x * (180 / math.pi),
     "radians deg2rad": lambda x: x * (math.pi / 180),
@@ -67,10 +60,11 @@ for _names, _function in {
     "heaviside": lambda x, at_zero: elementwise(
         "where", x == 0, at_zero, elementwise("where", x != x, x, (x > 0) * 1.0)
     ),
-    "sinc": lambda x: elementwise("where", x == 0, 1.0, elementwise("sin", x * math.pi) / _nonzero(x * math.pi)),
+    "sinc": lambda x: elementwise(
+        "where", x == 0, 1.0, elementwise("sin", x * math.pi) / elementwise("where", x * math.pi == 0, 1.0, x * math.pi)
+    ),
 }.items():
-    for _name in _names.split():
-        _register_ufunc(_name, _function)
+    _register_ufunc(_names, _function, len(inspect.signature(_function).parameters))
 
 
 # --- functions that are made of others ----------------------------------------------------------------------------------
@@ -131,7 +125,7 @@ def choose(a: Array, choices: Any) -> Any:
 
 @numpy_function()
 def unwrap(p: Array, discont: Any = None, axis: int = -1, *, period: Any = 2 * math.pi) -> Any:
-    """P with jumps of more than half a period removed: p_t + sum over u <= t of the correction of p_u - p_(u-1)."""
+    """Remove jumps of more than half a period: p_t + the sum over u <= t of the correction of p_u - p_(u-1)."""
     p = as_numbers(p)
     if p.row_shape[p.row_axes(axis)[0]] == 1:
         return p
@@ -146,11 +140,9 @@ def unwrap(p: Array, discont: Any = None, axis: int = -1, *, period: Any = 2 * m
 
 @numpy_function()
 def piecewise(x: Array, condlist: Any, funclist: Sequence[Any], *args: Any, **kw: Any) -> Any:
-    """Values, or results of functions, where conditions hold. The interpreter has applied the functions to x."""
+    """Choose by conditions; the last one that holds decides. `_convert_callables` has applied the functions to x."""
     conditions = list(condlist) if isinstance(condlist, (list, tuple)) else [condlist]
-    choices = list(funclist)
-    default = choices[-1] if len(choices) > len(conditions) else 0
-    result = as_operand(default)
-    for condition, choice in zip(conditions, choices, strict=False):  # the last condition that holds decides
+    result = as_operand(funclist[-1] if len(funclist) > len(conditions) else 0)
+    for condition, choice in zip(conditions, funclist, strict=False):
         result = elementwise("where", condition, as_operand(choice), result)
-    return as_array(result) * 1.0 if x.kind == "float" else result
+    return astype(result, x.kind)

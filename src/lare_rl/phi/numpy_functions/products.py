@@ -137,9 +137,11 @@ def _correlate(a: Array, v: Array, mode: str, reverse: bool) -> Any:
     if v.row_shape[0] > a.row_shape[0] and reverse:
         a, v = v, a
     n, m = a.row_shape[0], v.row_shape[0]
-    windows = FUNCTIONS["sliding_window_view"](FUNCTIONS["pad"](a, m - 1), m)
+    short, long = sorted((n, m))
+    windows = FUNCTIONS["sliding_window_view"](FUNCTIONS["pad"](a, m - 1), [m])
     full = matmul(windows, v[::-1] if reverse else v)
-    start, length = {"full": (0, n + m - 1), "same": ((m - 1) // 2, max(n, m)), "valid": (m - 1, n - m + 1)}[str(mode)]
+    same = (m - 1) // 2 if n >= m else n // 2  # NumPy swaps the series, and reverses the result
+    start, length = {"full": (0, n + m - 1), "same": (same, long), "valid": (short - 1, long - short + 1)}[str(mode)]
     return full[start : start + length]
 
 
@@ -169,18 +171,21 @@ def norm(x: Array, ord: Any = None, axis: Any = None, keepdims: Any = False) -> 
     axes = x.row_axes(axis)
     if len(axes) > 1 and ord is not None:
         return _matrix_norm(x, ord, axes, keepdims)
-    magnitude = abs(x)
-    if ord in (None, 2):
+    return _vector_norm(x, 2 if ord is None else ord, axis, keepdims)
+
+
+def _vector_norm(x: Array, order: Any, axis: Any, keepdims: Any) -> Any:
+    if order == 2:
         return elementwise("sqrt", along("sum", x * x, axis, keepdims))
-    if ord in (math.inf, -math.inf):
-        return along("max" if ord > 0 else "min", magnitude, axis, keepdims)
-    if ord == 0:
+    if order in (math.inf, -math.inf):
+        return along("max" if order > 0 else "min", abs(x), axis, keepdims)
+    if order == 0:
         return FUNCTIONS["count_nonzero"](x, axis, keepdims=keepdims) * 1.0
-    return power(along("sum", power(magnitude, ord), axis, keepdims), 1 / float(ord))
+    return power(along("sum", power(abs(x), order), axis, keepdims), 1 / float(order))
 
 
 def _matrix_norm(x: Array, order: Any, axes: tuple[int, ...], keepdims: Any) -> Any:
-    """Frobenius' norm, or the largest sum of magnitudes of a column or of a row."""
+    """Return Frobenius' norm, or the largest or smallest sum of the magnitudes of a column or of a row."""
     if order == "fro":
         return elementwise("sqrt", along("sum", x * x, axes, keepdims))
     if order in (1, -1, math.inf, -math.inf):
@@ -276,7 +281,9 @@ def _eigenvalues_3x3(a: Array, uplo: Any) -> Any:
 
 array_functions(
     {
-        "linalg.vector_norm": lambda x, *, axis=None, keepdims=False, ord=2: norm(x, ord, axis, keepdims),  # noqa: A006
+        "linalg.vector_norm": lambda x, *, axis=None, keepdims=False, ord=2: _vector_norm(  # noqa: A006
+            as_numbers(x), ord, axis, keepdims
+        ),
         "linalg.slogdet": lambda a: (elementwise("sign", det(a)), elementwise("log", abs(det(a)))),
         "linalg.solve": lambda a, b: matmul(inv(a), b),
     }

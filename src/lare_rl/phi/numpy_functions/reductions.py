@@ -6,19 +6,19 @@ import functools
 import math
 from typing import Any
 
+import numpy as np
+
 from lare_rl.phi.arrays import Array, as_array, broadcast, elementwise
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import ELEMENTWISE
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.numpy_functions.elementwise import UNARY
-from lare_rl.phi.numpy_functions.registry import FUNCTIONS, as_numbers, numpy_function, numpy_variants
+from lare_rl.phi.numpy_functions.registry import FUNCTIONS, array_functions, as_numbers, numpy_function, numpy_variants
 
-UFUNC_REDUCTIONS = {
-    "add": "sum", "multiply": "prod", "maximum": "max", "minimum": "min", "logical_and": "all", "logical_or": "any",
-    "fmax": "nanmax", "fmin": "nanmin",
+REDUCTIONS: dict[str, tuple[str, Any]] = {
+    "sum": ("add", 0), "prod": ("multiply", 1), "max": ("maximum", None), "min": ("minimum", None),
+    "any": ("logical_or", False), "all": ("logical_and", True),
 }  # fmt: skip
-NEUTRAL: dict[str, Any] = {"sum": 0, "prod": 1, "any": False, "all": True}
-"""What the entries that `where=` leaves out count as."""
+"""For each reduction, the function that it repeats, and what an entry counts as that `where=` leaves out, if anything."""
 
 
 def along(op: str, x: Array, axis: Any, keepdims: Any = False) -> Array:
@@ -26,8 +26,8 @@ def along(op: str, x: Array, axis: Any, keepdims: Any = False) -> Array:
     axes = x.row_axes(axis)
     if op.startswith("arg") and len(axes) != 1:
         x, axes = flatten_constant(x), (0,)
-    builder, node = current_builder(), x.node
-    reduced = builder.reduce(op, node, axes)
+    builder = current_builder()
+    reduced = builder.reduce(op, x.node, axes)
     if keepdims:
         reduced = builder.reshape(reduced, tuple(1 if i in axes else size for i, size in enumerate(x.row_shape)))
         return Array(reduced, x.batch_axis)
@@ -46,15 +46,13 @@ def flatten_constant(x: Array) -> Array:
 def reduce(
     op: str, a: Array, axis: Any = None, *, keepdims: Any = False, initial: Any = None, where: Any = True
 ) -> Any:
+    ufunc, neutral = REDUCTIONS[op]
     if where is not True:
-        if initial is None and op not in NEUTRAL:
+        if initial is None and neutral is None:
             raise RefusedError("E-NUMPY", f"np.{op} with where= needs initial=")
-        a = elementwise("where", where, a, NEUTRAL.get(op, initial))
+        a = elementwise("where", where, a, initial if neutral is None else neutral)
     result = along(op, a, axis, keepdims)
-    if initial is not None:
-        ufunc_for = {reduction: ufunc for ufunc, reduction in UFUNC_REDUCTIONS.items()}[op]
-        result = elementwise(ufunc_for, result, initial)
-    return result
+    return result if initial is None else elementwise(ufunc, result, initial)
 
 
 def _count(x: Array, axis: Any, keepdims: Any, where: Any = True) -> Any:
@@ -80,13 +78,14 @@ def average(a: Array, axis: Any = None, weights: Any = None, *, keepdims: Any = 
     weights = as_numbers(weights)
     if weights.ndim == 1 and a.ndim > 1 and axis is not None and weights.batch_axis is None:
         weights = weights[(..., *(None,) * (a.ndim - 1 - a.axis(axis)))]
-    weights = broadcast(weights, a.shape) if a.batch_axis is not None else weights
+    if weights.batch_axis is None or a.batch_axis is not None:
+        weights = broadcast(weights, a.shape)
     return _sum(a * weights, axis, keepdims) / _sum(weights, axis, keepdims)
 
 
 @numpy_variants({"var": False, "std": True})
-def spread(
-    has_root: bool,
+def var_or_std(
+    is_std: bool,
     a: Array,
     axis: Any = None,
     *,
@@ -99,8 +98,8 @@ def spread(
     center = FUNCTIONS["mean"](a, axis, keepdims=True, where=where) if mean is None else mean
     deviation = as_numbers(a) - center
     total = _sum(deviation * deviation, axis, keepdims, where)
-    variance = total / (_count(a, axis, keepdims, where) - (correction or ddof))
-    return elementwise("sqrt", variance) if has_root else variance
+    variance = total / elementwise("maximum", _count(a, axis, keepdims, where) - (correction or ddof), 0)
+    return elementwise("sqrt", variance) if is_std else variance
 
 
 SUBSTITUTES = {"sum": 0, "prod": 1, "max": -math.inf, "min": math.inf, "argmax": -math.inf, "argmin": math.inf}
@@ -121,31 +120,32 @@ def moment_without_nan(name: str, a: Array, axis: Any = None, *, keepdims: Any =
     return FUNCTIONS[name](elementwise("where", is_nan, 0, a), axis, keepdims=keepdims, where=~is_nan, **more)
 
 
-@numpy_variants({"argmax": "argmax", "argmin": "argmin"})
-def reduce_to_index(op: str, a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
-    return along(op, a, axis, keepdims)
-
-
-@numpy_function()
-def ptp(a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
-    return elementwise("subtract", along("max", a, axis, keepdims), along("min", a, axis, keepdims))
-
-
-@numpy_function()
-def count_nonzero(a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
-    return along("sum", elementwise("not_equal", a, 0), axis, keepdims)
-
-
-BINARY = ELEMENTWISE.keys() - UNARY
+array_functions(
+    {
+        "argmax": lambda a, axis=None, *, keepdims=False: along("argmax", a, axis, keepdims),
+        "argmin": lambda a, axis=None, *, keepdims=False: along("argmin", a, axis, keepdims),
+        "count_nonzero": lambda a, axis=None, *, keepdims=False: along(
+            "sum", elementwise("not_equal", a, 0), axis, keepdims
+        ),
+        "ptp": lambda a, axis=None, *, keepdims=False: elementwise(
+            "subtract", along("max", a, axis, keepdims), along("min", a, axis, keepdims)
+        ),
+    }
+)
+BINARY = [op for op in ELEMENTWISE if getattr(np, op).nin == 2]
 
 
 @numpy_variants({f"{ufunc}.reduce": ufunc for ufunc in BINARY})
 def reduce_by(
     ufunc: str, array: Array, axis: Any = 0, keepdims: Any = False, initial: Any = None, where: Any = True
 ) -> Any:
-    if ufunc in UFUNC_REDUCTIONS:
-        more = {"initial": initial, "where": where} if initial is not None or where is not True else {}
-        return FUNCTIONS[UFUNC_REDUCTIONS[ufunc]](array, axis, keepdims=keepdims, **more)
+    for op, (repeated, _) in REDUCTIONS.items():
+        if repeated == ufunc:
+            return reduce(op, array, axis, keepdims=keepdims, initial=initial, where=where)
+    if initial is not None or where is not True:
+        raise RefusedError("E-NUMPY", f"np.{ufunc}.reduce has no initial= and no where=: use np.where first")
+    if ufunc in ("fmax", "fmin"):
+        return reduce_without_nan(ufunc[1:], array, axis, keepdims=keepdims)
     for at in reversed(array.row_axes(axis)):
         slices = [array.select(at, slice(i, i + 1) if keepdims else i) for i in range(array.row_shape[at])]
         array = functools.reduce(lambda x, y: elementwise(ufunc, x, y), slices)

@@ -1,8 +1,7 @@
 """The functions of NumPy that a program can call, by name. Nothing else of NumPy can be reached.
 
-A function is registered with NumPy's name and parameters. Its annotations say what its arguments are converted to: an
-`Array`, an `Operand` (an array or x[mask]), a list of arrays, an int, a float. `out=` and `dtype=` are handled here for all
-functions.
+A function is registered with NumPy's name and parameters. `_CONVERSIONS` converts its arguments by their annotations: to an
+`Array`, an `Operand` (an array or x[mask]), a list, a number. `call_numpy` handles `out=` and `dtype=` for all functions.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from lare_rl.phi.values import Symbol, describe
 Function = Callable[..., Any]
 
 FUNCTIONS: dict[str, Function] = {}
-"""All functions, by their names behind `np.`: "sum", "linalg.norm", "add.reduce"."""
+"""Functions by their names behind `np.`: "sum", "linalg.norm", "add.reduce"."""
 
 KIND_OF_DTYPE: dict[str, NumberKind] = {
     **dict.fromkeys("float float16 float32 float64 double single half longdouble f4 f8 f d floating".split(), "float"),
@@ -66,10 +65,7 @@ _CONVERTERS: dict[str, dict[str, Callable[[Any], Any]]] = {}
 
 
 def numpy_function(*names: str) -> Callable[[Function], Function]:
-    """Register a function under NumPy's names for it, or else under its own without a last underscore.
-
-    Its annotations say what the arguments are converted to.
-    """
+    """Register a function under NumPy's names for it, or else under its own without a last underscore."""
 
     def register(function: Function) -> Function:
         signature = inspect.signature(function)
@@ -238,8 +234,10 @@ _CONVERSIONS: dict[str, Callable[[Any], Any]] = {
     "Array": as_array,
     "Operand": as_operand,
     "list[Array]": as_arrays,
+    "list[int]": as_sizes,
     "int": operator.index,
     "float": as_float,
     "Operand | None": _optional(as_operand),
     "int | None": _optional(operator.index),
+    "float | None": _optional(as_float),
 }

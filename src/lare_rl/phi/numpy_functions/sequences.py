@@ -15,6 +15,7 @@ from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
     array_functions,
     as_arrays,
+    as_list,
     as_numbers,
     numpy_function,
     numpy_variants,
@@ -43,7 +44,7 @@ array_functions(
 
 @numpy_variants({f"{op}.accumulate": op for op in ("maximum", "minimum", "fmax", "fmin", "logical_and", "logical_or")})
 def accumulate(ufunc: str, array: Array, axis: Any = 0) -> Any:
-    """By doubling: after k turns, an entry knows the 2^k before it."""
+    """By doubling: after k turns, an entry is the result of itself and the 2^k - 1 entries before it."""
     (at,) = array.row_axes(axis)
     size, shift = array.row_shape[at], 1
     while shift < size:
@@ -68,13 +69,14 @@ def diff(a: Array, n: int = 1, axis: int = -1, prepend: Any = None, append: Any 
 @numpy_function()
 def gradient(f: Array, *varargs: Any, axis: Any = None, edge_order: int = 1) -> Any:
     """Central differences inside, and one-sided differences at the ends."""
-    axes = f.row_axes(axis)
+    f.row_axes(axis)  # refuses the batch axis
+    axes = range(f.ndim) if axis is None else list(map(f.axis, as_list(axis)))
     spacings = [as_array(x) for x in (varargs if len(varargs) == len(axes) else (varargs or (1.0,)) * len(axes))]
     slopes = []
     for at, spacing in zip(axes, spacings, strict=True):
         slope = _gradient_along_last_axis(rearrange(np.moveaxis, as_numbers(f), at, -1), spacing, edge_order)
         slopes.append(rearrange(np.moveaxis, slope, -1, at))
-    return slopes[0] if isinstance(axis, int) or len(slopes) == 1 else slopes
+    return slopes[0] if len(slopes) == 1 else slopes
 
 
 def _gradient_along_last_axis(f: Array, spacing: Array, edge_order: int) -> Any:
@@ -144,7 +146,7 @@ def lexsort(keys: Any, axis: int = -1) -> Array:
 
 @numpy_function()
 def quantile(a: Array, q: Any, axis: Any = None, *, method: Any = "linear", keepdims: Any = False) -> Any:
-    """Between the two entries of the sorted numbers at (n - 1) q; NaN if one of the numbers is NaN."""
+    """Interpolate between the two sorted numbers next to the position (n - 1) q; NaN if one of all numbers is NaN."""
     fractions = require_constant(q, "q of np.quantile")
     axes = a.row_axes(axis)
     rest = [i for i in range(a.ndim) if i not in axes]

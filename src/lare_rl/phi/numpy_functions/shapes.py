@@ -19,12 +19,14 @@ from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import RefusedError
+from lare_rl.phi.numpy_functions.reductions import flatten_constant
 from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
     array_functions,
     as_arrays,
     as_list,
     as_sizes,
+    astype,
     numpy_function,
     numpy_functions,
     numpy_variants,
@@ -33,7 +35,7 @@ from lare_rl.phi.numpy_functions.registry import (
 
 
 def _register(names: str, convert: Callable[[Any], Any]) -> None:
-    """Register a function that moves the numbers of its first argument. Parameters of NumPy's that move nothing are left out."""
+    """Register a function that moves the numbers of its first argument, without those of its parameters that move nothing."""
     function: Any = functools.reduce(getattr, names.split()[0].split("."), np)
 
     def apply(moved: Any, *args: Any, **kwargs: Any) -> Any:
@@ -122,8 +124,9 @@ def unstack(x: Array, *, axis: int = 0) -> list[Array]:
 
 
 def _with_zeros(function: Callable[..., Any], a: Array, axes: tuple[int, ...], *args: Any) -> Array:
-    """Apply a function that fills with zeros."""
-    a.row_axes(axes)
+    """Apply a function of NumPy that moves numbers along `axes`, and fills with zeros."""
+    a.row_axes(axes)  # refuses the batch axis
+    # Zeros become -1, which `rearrange` takes for a zero.
     return rearrange(lambda positions, *args: function(positions + 1, *args) - 1, a, *args)
 
 
@@ -147,8 +150,8 @@ def roll(a: Array, shift: Any, axis: Any = None) -> Array:
 
 
 @numpy_function()
-def resize(a: Array, new_shape: Any) -> Array:
-    current_builder().check_size(as_sizes(new_shape))
+def resize(a: Array, new_shape: list[int]) -> Array:
+    current_builder().check_size(new_shape)
     return rearrange(np.resize, a, new_shape)
 
 
@@ -176,29 +179,35 @@ def pad(array: Array, pad_width: Any, mode: Any = "constant", *, constant_values
     if mode != "constant":
         text = f"np.pad, mode={str(mode)[:40]!r}: use constant, edge, reflect, symmetric or wrap"
         raise RefusedError("E-NUMPY", text)
-    fill = as_array(as_array(constant_values).number())
+    fill = astype(as_array(constant_values).number(), array.kind)
     return rearrange(lambda both: np.pad(both[0], widths, constant_values=both[1]), [array, fill])
+
+
+def _flatten_without_axis(arr: Array, axis: Any) -> tuple[Array, int]:
+    """Return an array and one of its axes; without `axis`, all its numbers in one axis."""
+    return (flatten_constant(arr), 0) if axis is None else (arr, arr.row_axes(axis)[0])
 
 
 @numpy_function()
 def delete(arr: Array, obj: Any, axis: Any = None) -> Any:
-    at = arr.row_axes(0 if axis is None and arr.ndim == 1 else axis)[0]
+    arr, at = _flatten_without_axis(arr, axis)
     return rearrange(np.delete, arr, obj, at)
 
 
 @numpy_function()
 def insert(arr: Array, obj: int, values: Array, axis: Any = None) -> Any:
-    at = arr.row_axes(0 if axis is None and arr.ndim == 1 else axis)[0]
+    arr, at = _flatten_without_axis(arr, axis)
     length = arr.row_shape[at]
     current_builder().check_size([math.prod(arr.row_shape) // length, length + math.prod(values.row_shape)])
     return rearrange(lambda both: np.insert(both[0], obj, both[1], at), [arr, values])
 
 
 @numpy_function("sliding_window_view", "lib.stride_tricks.sliding_window_view")
-def sliding_window_view(x: Array, window_shape: Any, axis: Any = None) -> Array:
-    sizes = as_sizes(window_shape)
-    current_builder().check_size([*x.row_shape, *(max(n, 1) for n in sizes)])
-    return rearrange(lambda positions: np.lib.stride_tricks.sliding_window_view(positions, sizes, axis).copy(), x)
+def sliding_window_view(x: Array, window_shape: list[int], axis: Any = None) -> Array:
+    current_builder().check_size([*x.row_shape, *(max(size, 1) for size in window_shape)])
+    return rearrange(
+        lambda positions: np.lib.stride_tricks.sliding_window_view(positions, window_shape, axis).copy(), x
+    )
 
 
 @numpy_function()
@@ -238,9 +247,19 @@ def copyto(dst: Array, src: Any, casting: Any = "same_kind", where: Any = True) 
 
 @numpy_function()
 def fill_diagonal(a: Array, val: Any) -> None:
-    a.row_axes(None)
-    step = sum(math.prod(a.row_shape[i + 1 :]) for i in range(a.ndim))
-    a.reshaped((-1,), None)[: a.row_shape[1] ** 2 : step] = val
+    a.row_axes(None)  # refuses the batch axis
+    if a.ndim < 2 or (a.ndim > 2 and len(set(a.row_shape)) > 1):
+        raise ValueError(f"np.fill_diagonal of the shape {a.shape}: use a matrix, or an array with axes of one length")
+    a[(list(range(min(a.row_shape))),) * a.ndim] = val
+
+
+@numpy_variants({"putmask": True, "place": False})
+def write_masked(is_aligned: bool, a: Array, mask: Array, values: Array) -> None:
+    """Write where a mask is true: a single number; or, if `is_aligned`, each number at the same place as in `values`."""
+    is_single = values.batch_axis is None and math.prod(values.row_shape) == 1
+    if not is_single and not (is_aligned and values.layout == a.layout):
+        raise RefusedError("E-NUMPY", "np.putmask and np.place repeat values: write a[...] = np.where(mask, values, a)")
+    copyto(a, values, where=mask)
 
 
 array_functions({"take_along_axis": lambda arr, indices, axis=-1: arr[_along_axis(arr, indices, axis)]})
@@ -249,6 +268,5 @@ numpy_functions(
         "put_along_axis": lambda arr, indices, values, axis: as_array(arr).__setitem__(
             _along_axis(as_array(arr), as_array(indices), axis), values
         ),
-        "putmask place": lambda a, mask, values: copyto(as_array(a), values, where=as_array(mask)),
     }
 )

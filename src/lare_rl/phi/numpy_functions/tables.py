@@ -18,7 +18,6 @@ from lare_rl.phi.numpy_functions.registry import (
     array_functions,
     as_float,
     as_numbers,
-    as_sizes,
     find_hint,
     numpy_function,
     numpy_variants,
@@ -37,7 +36,7 @@ def register_constant_function(
     Args:
         name: its name behind `np.`.
         options: the keywords that it takes.
-        largest: the most numbers of an argument, and the largest integer.
+        largest: the most numbers of an argument, and the largest integer or single number.
         work: what it costs to compute, for each of its arguments.
     """
     function: Any = functools.reduce(getattr, name.split("."), np)
@@ -57,10 +56,11 @@ def register_constant_function(
 
 def plain_constant(x: Any, name: str, largest: int) -> Any:
     """Return a small constant as NumPy takes it: a number, or an array of at most two axes."""
-    if isinstance(x, (bool, float)) or x is None:
+    if isinstance(x, bool) or x is None:
         return x
     values = require_constant(x, f"the arguments of np.{name}", find_hint(f"np.{name}"))
-    if values.ndim > 2 or values.size > largest or (values.dtype.kind == "i" and np.abs(values).max() > largest):
+    may_be_size = values.dtype.kind == "i" or not values.ndim  # np.hanning(5.0) is an array of five numbers
+    if values.ndim > 2 or values.size > largest or (may_be_size and np.abs(values.astype(float)).max() > largest):
         raise RefusedError("E-COST", f"np.{name} of more than {largest} numbers, or of larger integers")
     return values.item() if values.ndim == 0 else values
 
@@ -87,31 +87,30 @@ for _name in "pinv cholesky matrix_rank cond eigh svd svdvals qr".split():
     register_constant_function(f"linalg.{_name}", work=lambda x: np.size(x) * max(np.shape(x), default=1))
 
 
-def _steps_above(x: Array, edges: Array, op: str) -> Array:
-    """Return how many edges lie below each number (op "greater") or not above it ("greater_equal"). NaN lies above all."""
+def _insertion_index(x: Array, edges: Array, side: str) -> Array:
+    """Return how many edges lie below each number (side "left"), or not above it ("right"). NaN lies above all."""
     column = x[..., None]
-    return along("sum", ~(column <= edges if op == "greater" else column < edges), -1)
+    return along("sum", ~(column <= edges if side == "left" else column < edges), -1)
 
 
 @numpy_function()
 def searchsorted(a: Array, v: Array, side: Any = "left", sorter: Any = None) -> Any:
     edges = a if sorter is None else a[as_array(sorter)]
-    edges.row_axes(0)
-    return _steps_above(v, edges, "greater" if side == "left" else "greater_equal")
+    edges.row_axes(0)  # refuses the batch axis
+    return _insertion_index(v, edges, str(side))
 
 
 @numpy_function()
 def digitize(x: Array, bins: Array, right: Any = False) -> Any:
     edges = require_constant(bins, "the bins of np.digitize")
-    if len(edges) > 1 and edges[0] > edges[-1]:  # falling: bins[i - 1] > x >= bins[i]
-        count = _steps_above(x, as_array(edges), "greater_equal" if not right else "greater")
-        return len(edges) - count
-    return _steps_above(x, as_array(edges), "greater" if right else "greater_equal")
+    index = _insertion_index(x, as_array(edges), "left" if right else "right")
+    is_falling = len(edges) > 1 and edges[0] > edges[-1]
+    return len(edges) - index if is_falling else index
 
 
 @numpy_function()
 def interp(x: Array, xp: Array, fp: Array, left: Any = None, right: Any = None, period: Any = None) -> Any:
-    """Straight lines between the points (xp, fp), constant before the first and behind the last."""
+    """Return the value at x of straight lines between the points (xp, fp), constant before the first and behind the last."""
     knots = require_constant(xp, "xp of np.interp").astype(float)
     x = as_numbers(x)
     if period is not None:
@@ -139,18 +138,17 @@ def _interval(x: Array, knots: np.ndarray) -> Any:
     current_builder().check_size((math.prod(x.row_shape), len(knots)))
     if len(knots) == 2:
         return elementwise("isnan", x) * 0
-    return _steps_above(x, as_array(knots[1:-1]), "greater_equal")
+    return _insertion_index(x, as_array(knots[1:-1]), "right")
 
 
 @numpy_function()
-def unravel_index(indices: Array, shape: Any, order: Any = "C") -> tuple[Any, ...]:
-    sizes = as_sizes(shape)
-    return tuple((indices // stride) % size for stride, size in zip(_strides(sizes, order), sizes, strict=True))
+def unravel_index(indices: Array, shape: list[int], order: Any = "C") -> tuple[Any, ...]:
+    return tuple((indices // stride) % size for stride, size in zip(_strides(shape, order), shape, strict=True))
 
 
 @numpy_function()
-def ravel_multi_index(multi_index: Any, dims: Any, *, order: Any = "C") -> Any:
-    strides = _strides(as_sizes(dims), order)
+def ravel_multi_index(multi_index: Any, dims: list[int], *, order: Any = "C") -> Any:
+    strides = _strides(dims, order)
     return sum(as_array(index) * stride for index, stride in zip(multi_index, strides, strict=True))
 
 
@@ -187,9 +185,10 @@ def polyval(p: Any, x: Array) -> Any:
 
 
 @numpy_function("polynomial.polynomial.polyval")
-def rising_polyval(x: Array, c: Any, tensor: Any = True) -> Any:
-    """c_0 + c_1 x + ... + c_n x^n."""
-    return polyval(as_array(c)[::-1], x)
+def rising_polyval(x: Array, c: Array, tensor: Any = True) -> Any:
+    """c_0 + c_1 x + ... + c_n x^n. With `tensor`, each column of coefficients is a polynomial of all numbers."""
+    c = c[(..., *(None,) * x.ndim)] if c.ndim > 1 and tensor else c
+    return polyval(c[::-1], x)
 
 
 SERIES: dict[str, Callable[[Any], np.ndarray]] = {
@@ -199,12 +198,12 @@ SERIES: dict[str, Callable[[Any], np.ndarray]] = {
     "hermite_e.hermeval": np.polynomial.hermite_e.herme2poly,
     "laguerre.lagval": np.polynomial.laguerre.lag2poly,
 }
-"""How coefficients become those of powers."""
+"""What converts the coefficients of a series to those of powers."""
 
 
 @numpy_variants({f"polynomial.{name}": name for name in SERIES})
 def series_value(name: str, x: Array, c: Any, tensor: Any = True) -> Any:
-    return rising_polyval(x, SERIES[name](plain_constant(c, name, MAX_SYSTEM_SIZE)))
+    return rising_polyval(x, as_array(SERIES[name](plain_constant(c, name, MAX_SYSTEM_SIZE))))
 
 
 array_functions(
@@ -218,7 +217,7 @@ array_functions(
 
 
 @numpy_function("isin", "in1d")
-def isin(element: Array, test_elements: Any, invert: Any = False, assume_unique: Any = False) -> Any:
+def isin(element: Array, test_elements: Any, assume_unique: Any = False, invert: Any = False) -> Any:
     values = as_array(list(test_elements) if isinstance(test_elements, (dict, range)) else test_elements)
     values.row_axes(None)
     hit = along("any", element[..., None] == values.reshaped((-1,), None), -1)

@@ -1,7 +1,7 @@
-"""The functions of Python that a program can call."""
+"""The functions of Python that a program can call. Importing a module registers its functions."""
 
-from lare_rl.phi.python_functions import iterables, numbers, types
+from lare_rl.phi.python_functions import iterables, numbers, types  # noqa: F401
 from lare_rl.phi.python_functions.types import ERRORS
 from lare_rl.phi.runtime import BUILTINS
 
-__all__ = ["BUILTINS", "ERRORS", "iterables", "numbers", "types"]
+__all__ = ["BUILTINS", "ERRORS"]

@@ -10,9 +10,9 @@ from typing import Any
 
 from lare_rl.phi.arrays import Array
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, builtin_variants, check_key, varies
+from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, builtin_variants, check_key, make_set, varies
 from lare_rl.phi.text import format_value
-from lare_rl.phi.values import Bound, Class, Iterator, Set, Symbol
+from lare_rl.phi.values import Bound, Class, Iterator, Symbol
 
 ADDITION = Symbol("operator.add")
 
@@ -82,6 +82,13 @@ def filter_(runtime: Runtime, function: Any, values: Any) -> Iterator:
     return Iterator(filter(keep, runtime.items(values)))
 
 
+@builtin("zip")
+def zip_(runtime: Runtime, *values: Any, strict: Any = False) -> Iterator:
+    iterators = {id(value): value for value in values if isinstance(value, Iterator)}
+    entries = {key: iter(runtime.items(value)) for key, value in iterators.items()}  # zip(it, it) makes pairs
+    return Iterator(zip(*(entries.get(id(x)) or runtime.items(x) for x in values), strict=bool(strict)))
+
+
 @builtin("next")
 def next_(_: Runtime, iterator: Any, *default: Any) -> Any:
     if not isinstance(iterator, Iterator) or not (iterator or default):
@@ -97,21 +104,16 @@ def _make(convert: Callable[[Sequence[Any]], Any]) -> Callable[..., Any]:
     return lambda runtime, values=(): convert(runtime.meter.pay_for_list(runtime.items(values)))
 
 
-def _make_set(values: Sequence[Any]) -> Set:
-    return Set(dict.fromkeys(map(check_key, values)))
-
-
 BUILTINS |= {
     "list": _make(list),
     "tuple": _make(tuple),
-    "set": _make(_make_set),
-    "frozenset": _make(_make_set),
+    "set": _make(make_set),
+    "frozenset": _make(make_set),
     "iter": _make(Iterator),
     "reversed": _make(lambda values: Iterator(list(values)[::-1])),
     "all": lambda runtime, values: all(map(runtime.truth, runtime.items(values))),
     "any": lambda runtime, values: any(map(runtime.truth, runtime.items(values))),
     "enumerate": lambda runtime, values, start=0: Iterator(enumerate(runtime.items(values), operator.index(start))),
-    "zip": lambda runtime, *values, strict=False: Iterator(zip(*map(runtime.items, values), strict=bool(strict))),
     "map": lambda runtime, f, *values: _map(runtime, f, zip(*map(runtime.items, values), strict=False)),
     "itertools.starmap": lambda runtime, f, values: _map(runtime, f, map(runtime.items, runtime.items(values))),
     "slice": lambda _, *ends: slice(*ends),
@@ -146,7 +148,7 @@ LENGTHS: dict[str, Callable[..., int]] = {
     "repeat": lambda x, times: max(times, 0),
     "zip_longest": lambda *x, fillvalue=None: len(x) * max(map(len, x)),
 }
-"""The lengths of the results of functions of itertools, which are paid for first."""
+"""At least the lengths of what the functions of itertools return, which are paid for first."""
 
 
 @builtin_variants({f"itertools.{name}": name for name in LENGTHS})

@@ -13,22 +13,18 @@ from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions import call_numpy
 from lare_rl.phi.operand import Operand
-from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, builtin_variants, check_number, varies
+from lare_rl.phi.runtime import BINARY, BUILTINS, Runtime, builtin, builtin_variants, check_number, varies
 
 SAME_IN_NUMPY = {
     "fabs": "abs", "pow": "power", "atan2": "arctan2", "asin": "arcsin", "acos": "arccos", "atan": "arctan",
 }  # fmt: skip
-OPERATORS: dict[str, type[ast.operator]] = {
-    "add": ast.Add, "sub": ast.Sub, "mul": ast.Mult, "truediv": ast.Div, "floordiv": ast.FloorDiv, "mod": ast.Mod,
-    "pow": ast.Pow, "and_": ast.BitAnd, "or_": ast.BitOr, "xor": ast.BitXor, "matmul": ast.MatMult,
-}  # fmt: skip
 
 
 TEXTS: dict[type, str] = {
-    float: r"\s*[-+]?(\d{1,30}\.?\d{0,30}([eE][-+]?\d{1,3})?|inf|infinity|nan)\s*",
+    float: r"\s*[-+]?((\d{1,30}\.?\d{0,30}|\.\d{1,30})(e[-+]?\d{1,3})?|inf|infinity|nan)\s*",
     int: r"\s*[-+]?\d{1,18}\s*",
 }
-"""What a text of a number looks like."""
+"""What a text of a number looks like, in upper or lower case."""
 
 
 @builtin_variants({"float": float, "int": int})
@@ -39,7 +35,7 @@ def number(kind: type, _: Runtime, /, x: Any = 0) -> Any:
     if varies([x]):
         raise RefusedError("E-FLOW", f"{name}() of numbers that differ from row to row: use astype({name})")
     if isinstance(x, str) and not re.fullmatch(TEXTS[kind], x, re.IGNORECASE):
-        raise TypeError(f"{name}() of {x[:40]!r}")
+        raise ValueError(f"{name}() of {x[:40]!r}")
     if not isinstance(x, (bool, int, float, str, Array)):
         raise TypeError(f"{name}() of a value that is no number")
     return check_number(kind(x))
@@ -101,5 +97,5 @@ BUILTINS |= {
         lambda x, y: runtime.binary(ast.Mult(), x, y), runtime.items(values), start
     ),
     "operator.neg": lambda _, x: -x,
-    **{f"operator.{name}": _operator(op) for name, op in OPERATORS.items()},
+    **{f"operator.{function.__name__}": _operator(op) for op, function in BINARY.items()},
 }

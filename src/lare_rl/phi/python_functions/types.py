@@ -10,7 +10,7 @@ from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.registry import KIND_OF_DTYPE, astype, dtype_kind, dtype_name
 from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, check_text
 from lare_rl.phi.text import format_value
-from lare_rl.phi.values import Bound, Class, Function, Instance, Symbol, value_type
+from lare_rl.phi.values import Bound, Class, Decorated, Function, Instance, Symbol, value_type
 
 _EXCEPTIONS: list[type[Exception]] = [
     Exception, ValueError, TypeError, IndexError, KeyError, LookupError, ZeroDivisionError, ArithmeticError, AttributeError,
@@ -96,8 +96,8 @@ BUILTINS |= {
     "object": lambda _: Instance(Class("object", {})),
     "callable": lambda _, value: isinstance(value, (Function, Bound, Class)) or getattr(value, "name", "") in BUILTINS,
     "types.SimpleNamespace": lambda _, **attributes: Instance(Class("SimpleNamespace", {}), attributes),
-    "dataclasses.field": lambda runtime, *, default=None, default_factory=None, **_: (
-        default if default_factory is None else runtime.call(default_factory, [], {})
+    "dataclasses.field": lambda _, *, default=None, default_factory=None, **more: (
+        default if default_factory is None else Decorated("default_factory", default_factory)
     ),
     "np.dtype": lambda _, dtype: Symbol(f"np.{dtype_name(dtype)}") if dtype_kind(dtype) else None,
     "np.isscalar": lambda _, value: isinstance(value, (bool, int, float, str)),
