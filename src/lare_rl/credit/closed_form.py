@@ -237,10 +237,10 @@ def _fit_linear_types(
     indices = state.decoder.basis.column_group_index, state.decoder.basis.column_strength_index
 
     def fit_score_type(args: tuple[Int[Array, ""], Posterior, Posterior]) -> tuple[Posterior, Posterior]:
-        score_type, *starts = args
-        start, earlier = jax.tree.map(lambda leaf: leaf.astype(float), starts)
+        score_type, *earlier = args
+        groups, strengths = jax.tree.map(lambda leaf: leaf.astype(float), earlier)
         statistics = _score_type_statistics(state, score_type)
-        return relevance.fit(statistics, score_type, *indices, start, earlier, max_rounds, batched=batched)
+        return relevance.fit(statistics, score_type, *indices, groups, strengths, max_rounds, batched=batched)
 
     rows = jnp.asarray(linear_types), state.posterior, state.strengths
     return map_leading_axis(fit_score_type, rows, batched=batched)

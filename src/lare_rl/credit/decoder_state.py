@@ -96,7 +96,7 @@ def valid_rows(episodes: CreditBatch) -> Bool[Array, "rows *agents"]:
 
 
 class DecoderState(NamedTuple):
-    """What the rewards of a team are computed from. A method that fits nothing has no weights: it uses `scale` alone."""
+    """What the rewards of a team are computed from."""
 
     network: DecoderNetwork
     """f_psi."""
@@ -123,7 +123,7 @@ class DecoderState(NamedTuple):
 
     @property
     def closed_decoder(self) -> ClosedForm | None:
-        """The fit in closed form that `network` is taken from. None for other decoders, even if it determines their score type."""
+        """The fit in closed form, if it is the decoder and does not only determine the score type."""
         return None if self.optimizer else self.closed_form
 
 
