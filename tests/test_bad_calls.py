@@ -110,7 +110,9 @@ CALLS = {
     "lare_rl.logged_steps('none', 7)": "TaskSpec",
     "Method('mine', '', '', inputs=('observation',))": "method mine: ('observation',) is no InputNames: write",
     "Method('mine', '', '', fit='all steps')": "method mine: 'all steps' is no Fit: write Fit.ALL_STEPS",
+    "Method('mine', '', '', decoder=None)": "None is no str: write",
     "InputNames('action')": "a tuple of names",
+    "InputNames(5)": "a tuple of names",
     "Decoder('mine', 'mine:init', settings='hidden')": "a set of names",
 }
 """Bad calls, and what the message must contain."""
@@ -118,6 +120,7 @@ CALLS = {
 GOOD_CALLS = {
     "phi([0.5, 0], [0.5]).shape": "(2,)",
     "InputNames(['action']).names": "('action',)",
+    "InputNames(('next_observation', 'scored_observation')).resolve('after')": "('next_observation',)",
     "phi([[0.5, 0]] * 3, [[0.5]] * 3).shape": "(3, 2)",
     "policy([0.5, 0]).shape": "(1,)",
     "policy([[0.5, 0]] * 3).shape": "(3, 1)",

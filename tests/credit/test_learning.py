@@ -89,6 +89,23 @@ def test_prefixes_are_summed_like_separate_cases():
     np.testing.assert_allclose(statistics.products, np.cov(cases.T, bias=True) * 7, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("method", "score", "n_values", "expected"),
+    [
+        ("rd-linear", "auto", 2, True),
+        ("rd-linear", "auto", 3, False),
+        ("rd-linear", "binary", 2, False),
+        ("rd", "auto", 2, False),  # a gradient decoder cannot fit log odds
+    ],
+)
+def test_looks_binary(method, score, n_values, expected):
+    spec = observation_spec(2, METHODS[method], CreditSettings(score=score, hidden=(4,)), 4, fixed_length=False)
+    returns = jnp.arange(WINDOW) % n_values * 1.0
+    predictions = Predictions(jnp.float32(WINDOW), returns, returns[:, None], jnp.zeros(WINDOW, jnp.int32))
+    state = init(jax.random.key(0), spec)._replace(predictions=predictions)
+    assert learning.looks_binary(state, spec) == expected
+
+
 def test_the_rival_of_a_sum_may_be_the_log_odds():
     won = jnp.arange(WINDOW) % 2 * 1.0
     predicted = jnp.stack([0.9 * won, 0.1 * won], axis=1)

@@ -42,8 +42,7 @@ class Squares(eqx.Module):
     weight: Float[Array, " inputs"]
 
     def __call__(self, inputs, key):
-        r_hat = inputs**2 @ self.weight
-        return DecoderOutput(r_hat, jnp.zeros_like(r_hat))
+        return DecoderOutput(inputs**2 @ self.weight)
 
     def loss(self, inputs, length, target, mask, key):
         valid = jnp.arange(inputs.shape[1]) < length[:, None]
@@ -91,19 +90,28 @@ def test_decoder_with_functions_is_refused_in_one_line(registered):
 
 @pytest.mark.parametrize("agents", [1, 2])
 @pytest.mark.parametrize(
-    "call",
+    ("fit", "call"),
     [
-        lambda self, inputs, key: inputs @ self.weight,
-        lambda self, inputs, key: DecoderOutput(inputs @ self.weight, 0.0),
-        lambda self, inputs, key: DecoderOutput(inputs, inputs),
-        lambda self, inputs, key: DecoderOutput((inputs @ self.weight).ravel(), (inputs @ self.weight).ravel()),
+        (Fit.ALL_STEPS, lambda self, inputs, key: inputs @ self.weight),
+        (Fit.ALL_STEPS, lambda self, inputs, key: DecoderOutput(inputs @ self.weight, 0.0)),
+        (Fit.ALL_STEPS, lambda self, inputs, key: DecoderOutput(inputs)),
+        (Fit.ALL_STEPS, lambda self, inputs, key: DecoderOutput((inputs @ self.weight).ravel())),
+        (Fit.LIKELIHOOD, lambda self, inputs, key: DecoderOutput(inputs @ self.weight)),
+        (Fit.LIKELIHOOD, lambda self, inputs, key: DecoderOutput(inputs @ self.weight, log_std=inputs)),
     ],
 )
-def test_output_of_a_decoder_is_checked(call, agents, registered, monkeypatch):
+def test_output_of_a_decoder_is_checked(fit, call, agents, registered, monkeypatch):
     monkeypatch.setattr(Squares, "__call__", call)
-    register(Fit.ALL_STEPS)
+    register(fit)
     with pytest.raises(LareError, match=rf"'mine' must return DecoderOutput.* both of the shape \(2, {agents}\) for "):
         CreditAssigner("mine", observation_space=2, action_space=1, agents=agents, max_steps=5)
+
+
+def test_loss_of_a_decoder_is_required(registered, monkeypatch):
+    monkeypatch.delattr(Squares, "loss")
+    register(Fit.DECODER_LOSS)
+    with pytest.raises(LareError, match="'mine' has no method loss"):
+        CreditAssigner("mine", observation_space=2, action_space=1)
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,10 @@ gives one reward for each step, which all agents receive:
 The published penalty is 20 E Var_t(y), added to the squared error of the sum of T rewards. Here it is added to the squared
 error of their mean, hence 1 / T^2. y is multiplied by sqrt(T), as the outputs of other decoders are by sqrt(nT): see
 `CreditSpec.output_scale`.
-
-The adapter that LaRe's authors published repeats y_t over the agents, but then reads the array in another axis order. It
-thus gives rewards to the wrong agents and steps. Here all agents receive y_t at step t.
 """
 
 import math
+from itertools import pairwise
 
 import equinox as eqx
 import jax
@@ -70,7 +68,7 @@ class AREL(eqx.Module):
     position: Float[Array, "steps size"]
     time_blocks: tuple[Block, ...]
     agent_blocks: tuple[Block, ...]
-    read_out: tuple[Linear, Linear, Linear]
+    read_out: tuple[Linear, ...]
 
     def __init__(self, key: PRNGKeyArray, spec: CreditSpec):
         size = min(spec.n_inputs, MAX_WIDTH)
@@ -79,11 +77,8 @@ class AREL(eqx.Module):
         self.position = jax.random.normal(position_key, (spec.max_steps, size))
         self.time_blocks = tuple(Block(size, key=key) for key in jax.random.split(time_key, DEPTH))
         self.agent_blocks = tuple(Block(size, key=key) for key in jax.random.split(agents_key, DEPTH))
-        self.read_out = (
-            Linear(size, READ_OUT_WIDTH, key=read_keys[0]),
-            Linear(READ_OUT_WIDTH, READ_OUT_WIDTH, key=read_keys[1]),
-            Linear(READ_OUT_WIDTH, 1, key=read_keys[2]),
-        )
+        widths = pairwise((size, READ_OUT_WIDTH, READ_OUT_WIDTH, 1))
+        self.read_out = tuple(Linear(*width, key=key) for width, key in zip(widths, read_keys, strict=True))
 
     def __call__(self, inputs: Float[Array, "rows agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
         steps = len(self.position)

@@ -11,8 +11,8 @@ With u = (x - mean) / std over all steps, where x is a factor or a raw feature:
 
     extremes of factors      h(M) - h(M'),  M = max of u_i up to the step, M' before it;  minima and last values likewise (`history.py`)
 
-If the history of the episode is an input, the last group has, for each factor, its largest, smallest and last value, with h(M) = M and
-the shapes of M. Without factors, the raw features are tracked instead.
+If the history of the episode is an input, largest, smallest and last values have a group each for h(M) = M, and one for h = the shapes
+of M. Without factors, the raw features are tracked instead.
 
 Shapes are the first terms of the Fourier series of a function of one number, within four standard deviations of its mean.
 They can express "more is better up to this value", "near this value" or "beyond this value". Pairs express interactions, such as
@@ -66,11 +66,11 @@ class Basis:
     n_tracked: int = 0
     """The number of first inputs whose history follows them in a row: all factors or, without factors, all raw features."""
     n_levels: int = 0
-    """The number of levels that episodes may belong to. Each has an intercept, which is no feature of a step (`closed_form.py`)."""
+    """The number of levels that episodes may belong to. Each has an intercept (`closed_form.py`)."""
     prefixes: bool = False
     """Whether returns are fitted to prefixes of episodes. The number of steps so far then has a weight too."""
     start_value: bool = False
-    """Whether a sum may have a part that does not grow with the number of steps: the weight of 1/T in a fit of R/T."""
+    """Whether a sum may have a start value: the weight of 1/T in a fit of R/T (`closed_form.py`)."""
 
     @property
     def n_inputs(self) -> int:
@@ -85,14 +85,14 @@ class Basis:
     @property
     def group_sizes(self) -> dict[str, int]:
         """The number of features in each group that is not empty, in order."""
-        sizes = {"factors": self.n_factors}
-        if self.extended:
-            sizes["shapes of factors"] = 2 * N_FREQUENCIES * self.n_factors
-            sizes["pairs of factors"] = _n_pairs(self.n_factors)
-        sizes["raw features"] = self.n_raw_used
-        if self.extended:
-            sizes["shapes of raw features"] = 2 * self.raw_frequencies * self.n_raw_used
-            sizes["pairs of raw features"] = _n_pairs(self.n_raw_paired)
+        sizes = {
+            "factors": self.n_factors,
+            "shapes of factors": 2 * self.factor_frequencies * self.n_factors,
+            "pairs of factors": self._n_pairs(self.n_factors),
+            "raw features": self.n_raw_used,
+            "shapes of raw features": 2 * self.raw_frequencies * self.n_raw_used,
+            "pairs of raw features": self._n_pairs(self.n_raw_paired),
+        }
         for name in ("maxima", "minima", "last values"):
             sizes[f"{name} of tracked inputs"] = self.n_tracked
             sizes[f"shapes of {name} of tracked inputs"] = 2 * self.history_frequencies * self.n_tracked
@@ -109,11 +109,15 @@ class Basis:
         return self.n_raw if self.n_raw <= MAX_PAIRED_RAW_FEATURES else 0
 
     @property
+    def factor_frequencies(self) -> int:
+        """The number of frequencies of the shape of a factor."""
+        return N_FREQUENCIES if self.extended else 0
+
+    @property
     def raw_frequencies(self) -> int:
         """The number of frequencies of the shape of a raw feature."""
-        n_factor_features = self.n_factors * (1 + 2 * N_FREQUENCIES) + _n_pairs(self.n_factors)
-        n_free = max(0, MAX_FEATURES - n_factor_features - self.n_raw)
-        return min(N_FREQUENCIES, n_free // max(1, 2 * self.n_raw))
+        n_free = max(0, MAX_FEATURES - self.n_factor_features - self.n_raw)
+        return min(self.factor_frequencies, n_free // max(1, 2 * self.n_raw))
 
     @property
     def history_frequencies(self) -> int:
@@ -121,8 +125,15 @@ class Basis:
         return min(N_FREQUENCIES, MAX_HISTORY_FEATURES // max(1, 6 * self.n_tracked))
 
     @property
+    def n_factor_features(self) -> int:
+        """The number of features that are functions of factors alone. They are the first ones."""
+        return self.n_factors * (1 + 2 * self.factor_frequencies) + self._n_pairs(self.n_factors)
+
+    def _n_pairs(self, n_inputs: int) -> int:
+        return n_inputs * (n_inputs - 1) // 2 if self.extended else 0
+
+    @property
     def n_features(self) -> int:
-        """The total number of features."""
         return sum(self.group_sizes.values())
 
     @property
@@ -132,15 +143,16 @@ class Basis:
 
     @property
     def column_group_index(self) -> Int[np.ndarray, " columns"]:
-        """The index of each weight's group. The number of steps so far, or 1/T, is a group, and the intercepts are the last one."""
+        """The index of each weight's group."""
         return self._append_columns(self.group_index)
 
     @property
     def column_strength_index(self) -> Int[np.ndarray, " columns"]:
-        """The index of each weight's strength. The number of steps so far, or 1/T, has one, and the intercepts share the last one."""
+        """The index of each weight's strength."""
         return self._append_columns(self.strength_index)
 
     def _append_columns(self, index: Int[np.ndarray, " features"]) -> Int[np.ndarray, " columns"]:
+        """Append the number of steps so far, or 1/T, as a group of its own, and the intercepts as the last group."""
         for n_new in (int(self.prefixes or self.start_value), self.n_levels):
             index = np.append(index, np.full(n_new, index.max(initial=-1) + 1))
         return index
@@ -166,7 +178,7 @@ class Basis:
     @property
     def is_factor_feature(self) -> Bool[np.ndarray, " features"]:
         """Which features are functions of factors alone."""
-        return np.repeat(["factors" in name for name in self.group_sizes], list(self.group_sizes.values()))
+        return np.arange(self.n_features) < self.n_factor_features
 
 
 def expand(basis: Basis, u: Float[Array, "*batch inputs"]) -> Float[Array, "*batch features"]:
@@ -177,7 +189,7 @@ def expand(basis: Basis, u: Float[Array, "*batch inputs"]) -> Float[Array, "*bat
     return jnp.concatenate(
         [
             factors,
-            fourier_terms(factors, N_FREQUENCIES),
+            fourier_terms(factors, basis.factor_frequencies),
             pair_products(factors),
             raw,
             fourier_terms(raw, basis.raw_frequencies),
@@ -235,7 +247,3 @@ def _cos_sin(angle: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], Flo
         sine = 1 - square / ((n + 1) * (n + 2)) * sine
     sine = half * sine
     return cosine**2 - sine**2, 2 * sine * cosine
-
-
-def _n_pairs(n_inputs: int) -> int:
-    return n_inputs * (n_inputs - 1) // 2

@@ -21,9 +21,8 @@ paid for c. In a fit of R/T, it is the weight of 1/T, and the evidence sets its 
     R_k = c + sum_t (b + w . f_kt) + noise,     R_k / T_k = b + w . m_k + c / T_k + noise,     c ~ N(0, 1 / alpha_start)
 
 The features depend on the mean and the std that standardise x. If these changed with every step, the sums over earlier steps would
-be wrong, so they are kept constant for a while. Whenever the number of steps has grown by a half, they are updated and all stored
-episodes are summed again. As long as all episodes are stored, each step is summed three to four times in total, however many steps
-there are.
+be wrong, so they are kept constant until the number of steps has grown by a half. Then they are updated, and all stored episodes are
+summed again.
 
 The sums need float64: if features are nearly collinear, float32 loses all precision. The stored state holds each number as the
 sum of two float32 numbers. Call functions that take or return `SufficientStatistics` within `float64()`.
@@ -52,6 +51,7 @@ from lare_rl.nn.normalise import RunningMeanStd, running_std
 __all__ = [
     "ClosedForm",
     "LinearDecoder",
+    "drop_start_value",
     "fit",
     "fit_signs",
     "init",
@@ -86,8 +86,7 @@ class LinearDecoder(eqx.Module):
     bias: Float[Array, "*score_types"]
 
     def __call__(self, rows: Float[Array, "rows *agents inputs"], key: object = None) -> DecoderOutput:
-        r_hat = self.features(rows) @ self.weight + self.bias
-        return DecoderOutput(r_hat, jnp.zeros_like(r_hat))
+        return DecoderOutput(self.features(rows) @ self.weight + self.bias)
 
     def features(self, rows: Float[Array, "*batch inputs"]) -> Float[Array, "*batch features"]:
         """Return f(u)."""
@@ -130,10 +129,10 @@ class ClosedForm(NamedTuple):
 
 def init(basis: Basis, score_types: tuple[int, ...]) -> ClosedForm:
     """Return the state before the first episode."""
-    n_score_types, is_binary = len(score_types), ScoreType.LOG_ODDS in score_types
+    n_score_types, has_log_odds = len(score_types), ScoreType.LOG_ODDS in score_types
     posteriors = tuple(map(evidence.init_posterior, (basis.column_group_index, basis.column_strength_index)))
     posterior, strengths = jax.tree.map(
-        lambda leaf: jnp.tile(leaf, (n_score_types - is_binary, *[1] * leaf.ndim)), posteriors
+        lambda leaf: jnp.tile(leaf, (n_score_types - has_log_odds, *[1] * leaf.ndim)), posteriors
     )
     return ClosedForm(
         decoder=LinearDecoder(
@@ -150,7 +149,7 @@ def init(basis: Basis, score_types: tuple[int, ...]) -> ClosedForm:
         strengths=strengths,
         intercept=jnp.zeros((n_score_types, basis.n_levels)),
         start_value=jnp.zeros(n_score_types),
-        log_odds=logistic.init(basis.column_group_index) if is_binary else None,
+        log_odds=logistic.init(basis.column_group_index) if has_log_odds else None,
     )
 
 
@@ -178,7 +177,7 @@ def is_stale(state: ClosedForm, statistics: RunningMeanStd) -> Bool[Array, ""]:
 def reset_statistics(state: ClosedForm, statistics: RunningMeanStd) -> ClosedForm:
     """Set the sums to zero, and standardise by the mean and std of all steps so far.
 
-    The next fit starts from the precisions of the last one. Until then, the weights do not match the features.
+    Until the next fit, the weights do not match the features.
     """
     return state._replace(
         decoder=eqx.tree_at(lambda d: (d.mean, d.std), state.decoder, (statistics.mean, running_std(statistics))),
@@ -198,7 +197,7 @@ class _Weights(NamedTuple):
     """The result of a fit, for some score types."""
 
     columns: Float[Array, "score_types columns"]
-    """The weights of features, of the number of steps so far (only in fits to prefixes), and of levels."""
+    """The weights that `Basis.n_columns` counts."""
     bias: Float[Array, " score_types"]
     start_value: Float[Array, " score_types"]
 
@@ -235,26 +234,28 @@ def _fit_linear_types(
 ) -> tuple[Posterior, Posterior]:
     """Return the fits by groups and by strengths of all score types but log odds, along a leading axis."""
     linear_types = [score_type for score_type in score_types if score_type != ScoreType.LOG_ODDS]
-    basis, statistics = state.decoder.basis, to_float64(state.sufficient_statistics)
-    indices = basis.column_group_index, basis.column_strength_index
+    indices = state.decoder.basis.column_group_index, state.decoder.basis.column_strength_index
 
     def fit_score_type(args: tuple[Int[Array, ""], Posterior, Posterior]) -> tuple[Posterior, Posterior]:
-        score_type, *starts = args
-        start, earlier = jax.tree.map(lambda leaf: leaf.astype(float), starts)
-        sums = _drop_start_value(statistics, basis, score_type)
-        return relevance.fit(sums, score_type, *indices, start, earlier, max_rounds, batched=batched)
+        score_type, *earlier = args
+        groups, strengths = jax.tree.map(lambda leaf: leaf.astype(float), earlier)
+        statistics = _score_type_statistics(state, score_type)
+        return relevance.fit(statistics, score_type, *indices, groups, strengths, max_rounds, batched=batched)
 
     rows = jnp.asarray(linear_types), state.posterior, state.strengths
     return map_leading_axis(fit_score_type, rows, batched=batched)
 
 
-def _drop_start_value(
-    statistics: SufficientStatistics, basis: Basis, score_type: Int[Array, ""] | int
+def _score_type_statistics(state: ClosedForm, score_type: Int[Array, ""] | int) -> SufficientStatistics:
+    statistics, basis = to_float64(state.sufficient_statistics), state.decoder.basis
+    return drop_start_value(statistics, basis.n_features, score_type) if basis.start_value else statistics
+
+
+def drop_start_value(
+    statistics: SufficientStatistics, column: int, score_type: Int[Array, ""] | int
 ) -> SufficientStatistics:
-    """Return the sums of a score type. An average has a constant part already, so that 1/T explains nothing."""
-    if not basis.start_value:
-        return statistics
-    is_used = (np.arange(basis.n_columns + 2) != basis.n_features) | (score_type == ScoreType.SUM)
+    """Return the sums by which 1/T, at `column`, has the weight 0 unless the score is a sum: an average has a constant part already."""
+    is_used = (np.arange(len(statistics.mean)) != column) | (score_type == ScoreType.SUM)
     return statistics._replace(products=jnp.where(jnp.outer(is_used, is_used), statistics.products, 0))
 
 
@@ -294,7 +295,7 @@ def reward_std(
     best = relevance.select(state.strengths, state.posterior, basis.column_group_index, basis.column_strength_index)
     score_type = jnp.asarray(score_types)[linear_index]
     covariance = evidence.posterior_covariance(
-        _drop_start_value(to_float64(state.sufficient_statistics), basis, score_type),
+        _score_type_statistics(state, score_type),
         score_type,
         basis.column_strength_index,
         jax.tree.map(lambda leaf: leaf[linear_index].astype(float), best),
@@ -317,13 +318,11 @@ def fit_signs(state: ClosedForm) -> ClosedForm:
     v = jnp.concatenate([signs, -jnp.ones((len(signs), 1))], axis=1)
     error = jnp.sum((v @ statistics.products[:-1, :-1]) * v, axis=1)
     error = error + statistics.n_steps * (v @ statistics.mean[:-1]) ** 2
-    # The first index where it is true, as int32: the program around this one may be compiled without float64.
-    best = jax.lax.argmax(error == jnp.min(error), 0, jnp.int32)
+    best = evidence.first_true(error == jnp.min(error))
     return _set_weights(state, _Weights(signs[best][None], jnp.zeros(1), jnp.zeros(1)))
 
 
 def _set_weights(state: ClosedForm, weights: _Weights) -> ClosedForm:
-    """Set weights that were fitted to all episodes in the sums."""
     basis, (columns, bias, start_value) = state.decoder.basis, (values.astype(jnp.float32) for values in weights)
     return state._replace(
         decoder=eqx.tree_at(lambda d: (d.weight, d.bias), state.decoder, (columns[:, : basis.n_features], bias)),

@@ -26,6 +26,7 @@ from lare_rl.credit import closed_form
 from lare_rl.credit.closed_form import ClosedForm
 from lare_rl.credit.decoder_network import DecoderNetwork, DecoderOutput, FirstInput
 from lare_rl.credit.levels import LevelMeans, add_returns, empty_level_means, level_offsets
+from lare_rl.credit.methods import Fit
 from lare_rl.credit.prequential import Predictions, empty_predictions
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.credit.spec import CreditSpec
@@ -71,12 +72,20 @@ class CreditBatch(NamedTuple):
     level: Int[Array, " episodes"] | None = None
     """The level of each episode. None if levels make no difference."""
 
+    @property
+    def returns(self) -> Float[Array, " episodes"]:
+        """R."""
+        return self.mean_reward * self.length
+
+    @property
+    def valid_index(self) -> Int[Array, " rows"]:
+        """`episode_index`; for padding, an index within bounds."""
+        return jnp.minimum(self.episode_index, len(self.length) - 1)
+
 
 def step_rows(episodes: CreditBatch) -> Bool[Array, " rows"]:
     """Return which rows are steps of an episode of the batch, and not padding."""
-    n_episodes = len(episodes.length)
-    in_batch = episodes.mask[jnp.minimum(episodes.episode_index, n_episodes - 1)] > 0
-    return (episodes.episode_index < n_episodes) & in_batch
+    return (episodes.episode_index < len(episodes.length)) & (episodes.mask[episodes.valid_index] > 0)
 
 
 def valid_rows(episodes: CreditBatch) -> Bool[Array, "rows *agents"]:
@@ -87,7 +96,7 @@ def valid_rows(episodes: CreditBatch) -> Bool[Array, "rows *agents"]:
 
 
 class DecoderState(NamedTuple):
-    """What the rewards of a team are computed from. A method that fits nothing has no weights: it uses `scale` alone."""
+    """What the rewards of a team are computed from."""
 
     network: DecoderNetwork
     """f_psi."""
@@ -114,7 +123,7 @@ class DecoderState(NamedTuple):
 
     @property
     def closed_decoder(self) -> ClosedForm | None:
-        """The fit in closed form that `network` is taken from. None for other decoders, even if it determines their score type."""
+        """The fit in closed form, if it is the decoder and does not only determine the score type."""
         return None if self.optimizer else self.closed_form
 
 
@@ -122,14 +131,7 @@ def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
     """Return the state with an untrained decoder. All other functions need the same spec."""
     method, basis = spec.method, spec.basis
     network = FirstInput() if method.fit is None else method.decoder_kind.load_init()(key, spec)
-    for leaf in jax.tree.leaves(network):
-        if not eqx.is_array_like(leaf):
-            raise LareError(
-                f"the decoder {method.decoder!r} holds {short_repr(leaf)}, which cannot be trained: it may have arrays and static "
-                "fields; instead of eqx.nn.MLP, which holds functions, use lare_rl.nn.networks.MLP"
-            )
-    if not type(network).__module__.startswith("lare_rl."):
-        _check_output(network, spec)
+    _check_network(network, spec)
     n_types = len(spec.score_types)
     return DecoderState(
         network=network,
@@ -146,17 +148,30 @@ def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
     )
 
 
-def _check_output(network: DecoderNetwork, spec: CreditSpec) -> None:
-    """Raise `LareError` if a plugin's decoder does not return what it should."""
-    method = spec.method
+def _check_network(network: DecoderNetwork, spec: CreditSpec) -> None:
+    """Raise `LareError` if the fit of the method cannot train the decoder. What the decoders of this package return is not checked."""
+    method, name = spec.method, f"the decoder {spec.method.decoder!r}"
+    for leaf in jax.tree.leaves(network):
+        if not eqx.is_array_like(leaf):
+            raise LareError(
+                f"{name} holds {short_repr(leaf)}, which cannot be trained: it may have arrays and static fields; instead of eqx.nn.MLP, "
+                "which holds functions, use lare_rl.nn.networks.MLP"
+            )
+    if method.fit is Fit.DECODER_LOSS and not hasattr(network, "loss"):
+        raise LareError(f"{name} has no method loss, which Fit.DECODER_LOSS needs")
+    needs_std = method.fit is Fit.LIKELIHOOD
+    if type(network).__module__.startswith("lare_rl.") and not needs_std:
+        return
+    fields = "r_hat, log_std=log_std" if needs_std else "r_hat, penalty"
     n_rows = spec.max_steps if method.decoder_kind.whole_episodes else 2
     for agents in [(spec.agents,), ()] if spec.agents == 1 else [(spec.agents,)]:  # () in CreditAssigner
         rows = jax.ShapeDtypeStruct((n_rows, *agents, spec.n_inputs), jnp.float32)
         output = jax.eval_shape(lambda rows: network(rows, None), rows)
-        if not isinstance(output, DecoderOutput) or not output.r_hat.shape == output.penalty.shape == rows.shape[:-1]:
+        is_complete = isinstance(output, DecoderOutput) and (output.log_std is not None or not needs_std)
+        if not is_complete or {leaf.shape for leaf in jax.tree.leaves(output)} != {rows.shape[:-1]}:
             raise LareError(
-                f"the decoder {method.decoder!r} must return DecoderOutput(r_hat, penalty), both of the shape {rows.shape[:-1]} for "
-                f"inputs of the shape {rows.shape}: it returned {short_repr(output)}"
+                f"{name} must return DecoderOutput({fields}), both of the shape {rows.shape[:-1]} for inputs of the shape {rows.shape}: "
+                f"it returned {short_repr(output)}"
             )
 
 

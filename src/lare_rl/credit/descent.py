@@ -87,7 +87,6 @@ def update_in_chunks(
 def _step(
     state: DecoderState, loss: Float[Array, ""], gradient: DecoderNetwork, spec: CreditSpec
 ) -> tuple[DecoderState, dict[str, Float[Array, ""]]]:
-    """Take one step of Adam, with the weight decay added to the gradient."""
     gradient = jax.tree.map(lambda leaf, weight: leaf + spec.settings.weight_decay * weight, gradient, state.network)
     network, optimizer = adam_step(state.network, gradient, state.optimizer, spec.settings.learning_rate)
     return state._replace(network=network, optimizer=optimizer), {"credit/loss": loss}
@@ -101,8 +100,7 @@ def _mean_loss(
     weight = losses.episode_weight(episodes.length, episodes.mask, spec.settings.sum_form)
     output = decoder_state.decode(network, state, episodes.inputs, spec, key)
     agent_mean = partial(decoder_state.agent_mean, alive=episodes.alive)
-    r_hat, penalty = agent_mean(output.r_hat), agent_mean(output.penalty)
-    n_steps = episodes.length
+    r_hat, n_steps = agent_mean(output.r_hat), episodes.length
     if spec.method.samples_steps:
         n_sampled = len(r_hat) // n_episodes
         n_steps = jnp.minimum(n_steps, n_sampled)
@@ -118,10 +116,10 @@ def _mean_loss(
         loss = losses.unbiased_squared_error(mean, target, weight, variance)
     else:
         loss = losses.squared_error(mean, target, weight)
-    penalty = masked_mean(penalty, decoder_state.step_rows(episodes))
-    return loss + penalty * losses.batch_mean(
-        weight, weight
-    )  # the mean weight is 1 or, with `sum_form`, the mean of T^2
+    if output.penalty is None:
+        return loss
+    mean_weight = losses.batch_mean(weight, weight)  # 1 or, with `sum_form`, the mean of T^2
+    return loss + mean_weight * masked_mean(agent_mean(output.penalty), decoder_state.step_rows(episodes))
 
 
 def _decoder_loss(

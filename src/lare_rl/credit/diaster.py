@@ -39,8 +39,7 @@ class Diaster(eqx.Module):
         self.step_model = MLP(n_inputs, hidden, 1, key=step_key)
 
     def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
-        """Return the output of the step model, which has no noise and no penalty."""
-        return DecoderOutput(self.step_model(inputs)[..., 0], jnp.zeros(inputs.shape[:-1]))
+        return DecoderOutput(self.step_model(inputs)[..., 0])
 
     def piece_rewards(
         self, inputs: EpisodeInputs, begins: Bool[Array, "episodes steps"]

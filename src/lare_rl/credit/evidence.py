@@ -21,8 +21,8 @@ a group and gamma_g of them determined by the data (MacKay, Neural Computation 4
     gamma_g = n_g - alpha_g tr Sigma_gg,     alpha_g = gamma_g / |mu_g|^2,
     beta = (N - 1 - sum gamma) / (q - 2 mu . p + mu . S mu)
 
-The data switch off a group that does not help (its alpha grows), and switch on a group that is needed. Law et al. (NeurIPS 2018)
-regress on sums as well. Efroni et al. (AAAI 2021) show that such a regression recovers rewards.
+The data switch off a group that does not help: its alpha grows. Efroni et al. (AAAI 2021) show that a regression on sums recovers
+rewards.
 
 A score may instead be an average over the steps: R_k = b + w . m_k + N(0, 1 / (beta T_k)). The equations are the same, with y_k = R_k
 and the same S. The reward of a step is then (b + w . f) / T.
@@ -48,6 +48,7 @@ __all__ = [
     "add_episodes",
     "add_prefixes",
     "empty_statistics",
+    "first_true",
     "fit",
     "fixed_point",
     "init_posterior",
@@ -76,7 +77,7 @@ class SufficientStatistics(NamedTuple):
 
     n_episodes: Float[Array, ""]
     n_steps: Float[Array, ""]
-    """The sum of the weights. An episode has as many prefixes as steps, each of weight 1."""
+    """The sum of the weights."""
     mean: Float[Array, " features_and_targets"]
     products: Float[Array, "features_and_targets features_and_targets"]
     """sum_k T_k (v_k - mean)(v_k - mean)^T"""
@@ -190,11 +191,10 @@ def fit(
     2. equal shares, half of the variance noise;
     3. first group alone, almost no noise.
 
-    Without an earlier fit, start 1 is start 2, which then has one round. With an earlier fit and `Regression.has_many_episodes`, starts
-    2 and 3 have one round each.
+    Without an earlier fit, start 1 has equal shares too, and start 2 has one round. With an earlier fit and
+    `Regression.has_many_episodes`, starts 2 and 3 have one round each.
 
     Args:
-        alpha_index: for each feature, the index of its precision in alpha: that of its group, for example.
         start: an earlier fit, whose precisions start the iteration, or `init_posterior`.
         max_rounds: the maximum number of rounds of each iteration.
         batched: whether the three iterations run at once.
@@ -219,9 +219,13 @@ def starting_precisions(problem: Regression, start: Posterior) -> tuple[Float[Ar
 def most_likely(candidates: Posterior) -> Posterior:
     """Return the candidate with the largest evidence. Among candidates within `TOLERANCE` of it, return the first."""
     log_evidence = jnp.nan_to_num(candidates.log_evidence, nan=-jnp.inf)
-    # The first index where it is true, as int32: the program around this one may be compiled without float64.
-    best = jax.lax.argmax(log_evidence > jnp.max(log_evidence) - TOLERANCE, 0, jnp.int32)
+    best = first_true(log_evidence > jnp.max(log_evidence) - TOLERANCE)
     return jax.tree.map(lambda leaf: leaf[best], candidates)
+
+
+def first_true(mask: Bool[Array, " values"]) -> Int[Array, ""]:
+    """Return the first index where `mask` is true, as int32: the program around this one may be compiled without float64."""
+    return jax.lax.argmax(mask, 0, jnp.int32)
 
 
 def unscale(

@@ -39,13 +39,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import closed_form, evidence, relevance
-from lare_rl.credit.basis import N_FREQUENCIES, Basis
+from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import ClosedForm
 from lare_rl.credit.decoder_state import CreditBatch, valid_rows
 from lare_rl.credit.evidence import SufficientStatistics
 from lare_rl.credit.learning import add_to_sums
 from lare_rl.credit.precisions import AlphaIndex, Posterior, Regression
 from lare_rl.credit.score_type import ScoreType
+from lare_rl.envs.interface import AnyArray
 from lare_rl.nn.normalise import RunningMeanStd
 
 __all__ = ["Explanation", "ExplanationState", "add_to_explanation", "explain", "init_explanation"]
@@ -54,7 +55,6 @@ MAX_EXPLANATION_ROUNDS = 100
 """The maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
 MIN_MEAN_STD = 1e-5
 """The means of a standardised factor over episodes vary by more than rounding if their standard deviation exceeds this."""
-
 MIN_SAME = 1 - 2e-6
 """Two factors are the same if the square of the correlation of their means over episodes exceeds this."""
 MIN_DETERMINED = 0.05
@@ -62,59 +62,62 @@ MIN_DETERMINED = 0.05
 
 
 class ExplanationState(NamedTuple):
-    """Sums over episodes, and over steps of each factor's own features, which are the factor and its shapes."""
+    """Sums over episodes, and sums over steps of the functions of factors and of their products."""
 
     closed_form: ClosedForm
     n_steps: Float[Array, ""]
     total: Float[Array, " features"]
     """Of all functions of factors."""
     products: Float[Array, "factors single single"]
-    """Of two features of the same factor."""
+    """Of two features of the same factor: the factor and its shapes."""
     factor_products: Float[Array, "factors features"]
     """Of a factor and any function of factors."""
 
 
-class Explanation(NamedTuple):
-    """The explanation of one team's returns."""
+_NO_FACTORS = np.zeros(0)
 
-    n_episodes: Float[Array, ""]
-    mean_length: Float[Array, ""]
-    explains_mean_reward: Bool[Array, ""]
+
+class Explanation(NamedTuple):
+    """The explanation of one team's returns. Without factors, their fields are empty."""
+
+    n_episodes: Float[AnyArray, ""]
+    mean_length: Float[AnyArray, ""]
+    explains_mean_reward: Bool[AnyArray, ""]
     """Whether R/T is explained, not R: the score is a sum, and episodes differ in length."""
-    total_r2: Float[Array, ""]
+    total_r2: Float[AnyArray, ""]
     """R^2 of factors and raw features together. NaN if there are too few returns, or if they do not vary."""
-    raw_feature_used: Bool[Array, " raw"]
+    raw_feature_used: Bool[AnyArray, " raw"]
     """Whether the returns depend on a raw feature. All are used unless each has a strength of its own (`relevance.py`)."""
-    raw_feature_shares: Float[Array, " raw"]
+    raw_feature_shares: Float[AnyArray, " raw"]
     """The share of the variation that each raw feature explains, with its shapes and half of its pairs. It is a part of `total_r2`."""
-    factors_r2: Float[Array, ""]
-    """R^2 of the factors alone, with their shapes and pairs; 0 if there are no factors."""
-    factor_varies: Bool[Array, " factors"]
+    residual_correlation: Float[AnyArray, " raw"]
+    """The correlation of each raw feature with the residual of the fit on factors; 0 for a raw feature that has never varied."""
+    factors_r2: Float[AnyArray, ""] = np.zeros(())
+    """R^2 of the factors alone, with their shapes and pairs."""
+    factor_varies: Bool[AnyArray, " factors"] = _NO_FACTORS > 0
     """Whether a factor's mean differs between episodes by more than rounding."""
-    factor_shares: Float[Array, " factors"]
+    factor_shares: Float[AnyArray, " factors"] = _NO_FACTORS
     """The share of the variation that each factor explains, with its shapes and half of its pairs. It is negative if the factor offsets
     others. The shares add up to `factors_r2`."""
-    pair_shares: Float[Array, " factors"]
+    pair_shares: Float[AnyArray, " factors"] = _NO_FACTORS
     """The part of `factor_shares` that comes from the factor's pairs with other factors."""
-    slope: Float[Array, " factors"]
+    slope: Float[AnyArray, " factors"] = _NO_FACTORS
     """How much a step's reward rises if a factor rises by one standard deviation: the slope of the line that is closest to its effect
     in the fit on factors; 0 if its mean does not vary. If the score is an average, it is that of a step of an episode of average length."""
-    slope_covariance: Float[Array, "factors factors"]
+    slope_covariance: Float[AnyArray, "factors factors"] = np.zeros((0, 0))
     """The posterior covariance of `slope`."""
-    linear_share: Float[Array, " factors"]
+    linear_share: Float[AnyArray, " factors"] = _NO_FACTORS
     """The share of the variance of each factor's effect that this line has; 1 for a factor without effect."""
-    std: Float[Array, " factors"]
+    std: Float[AnyArray, " factors"] = _NO_FACTORS
     """The standard deviation that `slope` is for, in the factor's own unit."""
-    same_as: Int[Array, " factors"]
+    same_as: Int[AnyArray, " factors"] = np.zeros(0, int)
     """The index of another factor with the same mean in all episodes, up to scale and offset; -1 if there is none."""
-    residual_correlation: Float[Array, " raw"]
-    """The correlation of each raw feature with the residual of the fit on factors; 0 for a raw feature that has never varied."""
 
 
 def init_explanation(statistics: RunningMeanStd, basis: Basis) -> ExplanationState:
     """Return empty sums. `statistics` standardise the inputs, and the features of `basis` explain the returns."""
     closed = closed_form.reset_statistics(closed_form.init(basis, (ScoreType.SUM,)), statistics)
-    (factors, single), features = _single_features(basis).shape, int(np.sum(basis.is_factor_feature))
+    (factors, single), features = _single_features(basis).shape, basis.n_factor_features
     products = jnp.zeros((factors, single, single)), jnp.zeros((factors, features))
     return ExplanationState(closed, jnp.zeros(()), jnp.zeros(features), *products)
 
@@ -142,15 +145,9 @@ def explain(
     explains_mean_reward = (score_type == ScoreType.SUM) & _lengths_differ(statistics)
     if basis.start_value:
         statistics, basis = _subtract(statistics, basis.n_features, start_value), replace(basis, start_value=False)
-    is_factor, extended = basis.is_factor_feature, int(basis.extended)
+    is_factor = basis.is_factor_feature
     full = _fit(statistics, score_type, basis.group_index, basis.strength_index)
-    raw_single, raw_pairs = _input_shares(
-        full.feature_shares[~is_factor],
-        basis.n_raw_used,
-        extended * basis.raw_frequencies,
-        extended * basis.n_raw_paired,
-    )
-    no_factor = jnp.zeros(0)
+    raw_single, raw_pairs = _input_shares(full.feature_shares[~is_factor], basis.n_raw_used, basis.raw_frequencies)
     mean_length = statistics.n_steps / jnp.maximum(statistics.n_episodes, 1)
     explanation = Explanation(
         n_episodes=statistics.n_episodes,
@@ -159,15 +156,6 @@ def explain(
         total_r2=full.r2,
         raw_feature_used=_is_used(full, basis),
         raw_feature_shares=raw_single + raw_pairs,
-        factors_r2=jnp.zeros(()),
-        factor_varies=no_factor > 0,
-        factor_shares=no_factor,
-        pair_shares=no_factor,
-        slope=no_factor,
-        slope_covariance=jnp.zeros((0, 0)),
-        linear_share=no_factor,
-        std=no_factor,
-        same_as=jnp.zeros(0, int),
         residual_correlation=jnp.zeros(basis.n_raw_used),
     )
     if not is_factor.any():
@@ -175,9 +163,7 @@ def explain(
     factor_statistics, group_index = _select(statistics, np.flatnonzero(is_factor)), basis.group_index[is_factor]
     lines = _lines_of_pairs(state)
     factors = _fit(factor_statistics, score_type, group_index, group_index, lines)
-    single, pairs = _input_shares(
-        factors.feature_shares, basis.n_factors, extended * N_FREQUENCIES, extended * basis.n_factors
-    )
+    single, pairs = _input_shares(factors.feature_shares, basis.n_factors, basis.factor_frequencies)
     root = evidence.posterior_covariance(factor_statistics, score_type, group_index, factors.posterior).root
     root = root + root @ lines.T
     slope, slope_covariance, linear_share = _slopes(
@@ -267,18 +253,19 @@ def _select(statistics: SufficientStatistics, features: Int[np.ndarray, " select
 
 def _single_features(basis: Basis) -> Int[np.ndarray, "factors single"]:
     """Return the indices of the features of each factor alone, the linear one first."""
-    n_single = 1 + 2 * N_FREQUENCIES if basis.extended else 1
+    n_single = 1 + 2 * basis.factor_frequencies
     return np.arange(basis.n_factors)[:, None] + basis.n_factors * np.arange(n_single)
 
 
 def _input_shares(
-    feature_shares: Float[Array, " features"], n_inputs: int, n_frequencies: int, n_paired: int
+    feature_shares: Float[Array, " features"], n_inputs: int, n_frequencies: int
 ) -> tuple[Float[Array, " inputs"], Float[Array, " inputs"]]:
     """Return the sums of the shares of each input's own features, and of its pairs.
 
     A pair gives half to each of its inputs. Either all inputs are paired, or none.
     """
-    n_single, (i, j) = 1 + 2 * n_frequencies, np.triu_indices(n_paired, 1)
+    n_single = 1 + 2 * n_frequencies
+    i, j = np.triu_indices(n_inputs if len(feature_shares) > n_single * n_inputs else 0, 1)
     single = jnp.sum(feature_shares[: n_single * n_inputs].reshape(n_single, n_inputs), axis=0)
     half = feature_shares[n_single * n_inputs :] / 2
     return single, jnp.zeros_like(single).at[i].add(half).at[j].add(half)
@@ -327,7 +314,7 @@ def _residual_correlation(problem: Regression, basis: Basis, posterior: Posterio
 
     `problem` is the regression on all features, `posterior` that of the fit on the factors.
     """
-    n_factor_features = int(np.sum(basis.is_factor_feature))
+    n_factor_features = basis.n_factor_features
     weight = posterior.weight / jnp.where(problem.y_std > 0, problem.y_std, 1)
     weight = jnp.zeros(basis.n_features).at[:n_factor_features].set(weight)
     residual_variance = problem.q - 2 * weight @ problem.p + weight @ problem.s @ weight

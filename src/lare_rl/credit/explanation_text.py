@@ -10,6 +10,7 @@ from lare_rl.credit import decoder_state, learning
 from lare_rl.credit.basis import MAX_PAIRED_RAW_FEATURES
 from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.explanation import Explanation
+from lare_rl.credit.prequential import LITTLE_R2
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.tasks.spec import base_name
@@ -22,8 +23,6 @@ LEGEND_CODES = ("about_shares", "about_states", "products_not_read")
 """Findings that explain how to read others. They need to be printed once."""
 MIN_EXPLAINED_EPISODES = 20
 """With fewer episodes, nothing is said."""
-LITTLE_SHARE = 0.1
-"""Factors that explain a smaller share of the variation of the returns explain next to nothing."""
 COMPLETE_SHARE = 0.95
 """No factor is missing if the factors explain a larger share."""
 NOTICEABLE_SHARE = 0.05
@@ -38,16 +37,17 @@ NEGLIGIBLE_FRACTION = 0.01
 """A factor surely has no effect if the deviation of its effect is a smaller fraction of the largest effect."""
 STRIKING_CORRELATION = 0.3
 """A raw feature is reported if its correlation with the residual of the factors is larger."""
-N_LARGEST = 3
-"""The number of raw features that are named."""
-N_UNUSED = 12
-"""The number of unused raw features that are named."""
-N_GROUPS = 8
-"""The number of groups of episodes that are named."""
+N_LARGEST, N_UNUSED, N_GROUPS = 3, 12, 8
+"""This many raw features with large shares, unused raw features, and groups of episodes are named."""
 
+_WHERE_TO_SET = "in the task file, `--credit.score`, or `CreditSettings(score=...)`."
+_TREATED_AS = "The score is treated as {this} over the steps of an episode"
 _SET_SCORE_TYPE = (
-    'This may change. If you know which it is, set it: `score = "sum"` or `score = "average"` in the task file, '
-    "`--credit.score`, or `CreditSettings(score=...)`."
+    f'This may change. If you know which it is, set it: `score = "sum"` or `score = "average"` {_WHERE_TO_SET}'
+)
+_HIGH = (
+    "Returns are higher than the factors predict when {{name}} is {size} (correlation {{correlation:+.2f}}): a factor may be "
+    "missing{{scored_observation}}."
 )
 
 MESSAGES = {
@@ -55,25 +55,17 @@ MESSAGES = {
         "There is nothing to explain: all episodes have the same return or, if the score is a sum, the same mean reward of a "
         "step."
     ),
-    "score_type_is_certain": (
-        "The score is treated as {this} over the steps of an episode, which so far predicts returns better than {other}. "
-        f"{_SET_SCORE_TYPE}"
-    ),
-    "score_type_is_uncertain": (
-        "The score is treated as {this} over the steps of an episode: so far, {other} predicts returns about as well. "
-        f"{_SET_SCORE_TYPE}"
-    ),
+    "score_type_is_certain": (f"{_TREATED_AS}, which so far predicts returns better than {{other}}. {_SET_SCORE_TYPE}"),
+    "score_type_is_uncertain": (f"{_TREATED_AS}: so far, {{other}} predicts returns about as well. {_SET_SCORE_TYPE}"),
     "score_is_log_odds": (
         "Steps are paid for what they add to the log odds of the higher score, which so far predicts returns better than a sum. "
         "The shares and effects below are those of a sum."
     ),
     "score_is_not_log_odds": (
-        "The score is treated as {this} over the steps of an episode, which so far predicts returns at least as well as the log "
-        "odds of the higher score. This may change."
+        f"{_TREATED_AS}, which so far predicts returns at least as well as the log odds of the higher score. This may change."
     ),
     "looks_binary": (
-        'The last returns have only two values. If the score is won or lost, set it: `score = "binary"` in the task file, '
-        "`--credit.score`, or `CreditSettings(score=...)`."
+        f'The last returns have only two values. If the score is won or lost, set it: `score = "binary"` {_WHERE_TO_SET}'
     ),
     "groups_differ": "Beside what its steps earn, an episode returns: {groups}{more}. No step is paid for this.",
     "start_value": "Beside what its steps earn, each episode returns {value:+.3g}. No step is paid for this.",
@@ -124,14 +116,8 @@ MESSAGES = {
         "which action is best in which state, one action is preferred everywhere: write a phi that has it as a factor."
     ),
     "more_names": " and {count} more",
-    "high_when_large": (
-        "Returns are higher than the factors predict when {name} is large (correlation {correlation:+.2f}): a factor may be missing"
-        "{scored_observation}."
-    ),
-    "high_when_small": (
-        "Returns are higher than the factors predict when {name} is small (correlation {correlation:+.2f}): a factor may be missing"
-        "{scored_observation}."
-    ),
+    "high_when_large": _HIGH.format(size="large"),
+    "high_when_small": _HIGH.format(size="small"),
     "scored_observation_may_be_wrong": ", or the task's `scored_observation` may be wrong",
 }
 """The sentences, by the codes of the findings."""
@@ -176,14 +162,13 @@ def explanation_findings(
     """Return what an explanation says.
 
     Args:
-        explanation: the explanation of one team's score.
-        score_type: the estimated type of the score. None if it is set, or makes no difference.
+        score_type: None if it is set, or makes no difference.
         factors: names of the factors; empty for a method without factors.
         raw_features: names of the raw features; empty if they have none. Then nothing is said of single features.
-        looks_binary: whether the score should be tried as one that is won or lost (`learning.looks_binary`).
+        looks_binary: `learning.looks_binary`.
         start_value: what each episode returns beside its steps (`decoder_state.start_value`).
         groups: what an episode of each group returns beside its steps (`decoder_state.level_effects`), by the group's name.
-        lacks_pairs: whether pairs of raw features are left out, because there are too many raw features.
+        lacks_pairs: whether there are too many raw features for pairs of them.
     """
     n_episodes, factors_r2 = int(explanation.n_episodes), float(explanation.factors_r2)
     if n_episodes < MIN_EXPLAINED_EPISODES:
@@ -206,7 +191,7 @@ def explanation_findings(
     shares = round_shares([factors_r2, added, 1 - factors_r2 - added])
     raw = Finding("raw_features_add", {"share": shares[1]}) if raw_features and added >= 0.01 else None
     findings.append(Finding("factors_explain", {"share": shares[0], "target": target, "raw": raw}))
-    if factors_r2 < LITTLE_SHARE:
+    if factors_r2 < LITTLE_R2:
         findings.append(Finding("phi_explains_little"))
     else:
         findings += [Finding("about_factors"), *_factor_findings(explanation, factors, shares[0])]
@@ -234,7 +219,6 @@ def _groups(effects: Mapping[Any, float]) -> list[Finding]:
 
 
 def _more(count: int) -> Finding | None:
-    """Report how many names are left out."""
     return Finding("more_names", {"count": count}) if count > 0 else None
 
 
@@ -320,14 +304,7 @@ def _factor(
             effect = Finding("unclear_effect", effect.values)
         else:
             per_unit = float((explanation.slope[varied] / explanation.std[varied]).sum())
-    values = {
-        "name": name,
-        "share": share,
-        "effect": effect,
-        "per_unit": per_unit,
-        "states": states,
-        "shape": shape,
-    }
+    values = {"name": name, "share": share, "effect": effect, "per_unit": per_unit, "states": states, "shape": shape}
     return Finding("factor", values)
 
 

@@ -1,11 +1,8 @@
 """How well factors predict returns that a fit has not seen, and the explanation of all returns by the factors.
 
-    R^2 = 1 - sum_k (R_k - R_hat_k)^2 / sum_k (R_k - mean R)^2
-
-R_hat_k is predicted by a closed-form fit, on the factors alone, to episodes before k (the prequential principle: Dawid, Journal
-of the Royal Statistical Society A 147, 1984). The fit is repeated whenever the number of episodes has grown by a twentieth. Returns
-are predicted before a fit sees them, but the factors are standardised over all episodes. R^2 thus allows comparing two functions
-with different numbers of factors.
+R_hat_k of `prequential.py` is here predicted by a closed-form fit, on the factors alone, to episodes before k (the prequential
+principle: Dawid, Journal of the Royal Statistical Society A 147, 1984). The fit is repeated whenever the number of episodes has grown
+by a twentieth. The factors are standardised over all episodes. R^2 thus compares functions with different numbers of factors.
 
 If episodes belong to levels, each level has an intercept beside the factors, as in training (`closed_form.py`).
 """
@@ -23,14 +20,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import evidence, explanation
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.closed_form import FIT_GROWTH, MAX_EVIDENCE_ROUNDS
+from lare_rl.credit.closed_form import FIT_GROWTH, MAX_EVIDENCE_ROUNDS, drop_start_value
 from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.evidence import SufficientStatistics
 from lare_rl.credit.explanation import Explanation, ExplanationState
 from lare_rl.credit.learning import mean_features
 from lare_rl.credit.precisions import Posterior
+from lare_rl.credit.prequential import Predictions
 from lare_rl.credit.score_type import (
-    ROUNDING,
     ScoreType,
     ScoreTypeEstimate,
     compare_score_types,
@@ -82,36 +79,38 @@ def assess_factors(
         level: the level of each episode, from 0 on, if there are levels.
     """
     length = np.array([len(episode) for episode in inputs])
-    lengths_differ = len(set(length)) > 1
-    score_types = score_types_to_fit(score or "auto", fixed_length=not lengths_differ, allow_log_odds=False)
+    fixed_length = len(set(length)) == 1
+    score_types = score_types_to_fit(score or "auto", fixed_length, allow_log_odds=False)
+    one_hot = np.zeros((len(returns), 0)) if level is None else np.eye(int(level.max()) + 1)[level]
+    with_levels = replace(basis, n_levels=one_hot.shape[1], start_value=True)
+    later_returns = returns[N_FIRST:]
     with float64():
         features, state = add_episodes(inputs, alive, returns, replace(basis, start_value=True))
-        one_hot = np.zeros((len(returns), 0)) if level is None else np.eye(int(level.max()) + 1)[level]
         columns = np.hstack([features, 1 / length[:, None], one_hot])
-        with_levels = replace(basis, n_levels=one_hot.shape[1], start_value=True)
+        column, n_features = np.arange(columns.shape[1]), features.shape[1]
         predict = partial(predict_returns, returns=returns, length=length, basis=with_levels)
-        fits = {score_type: predict(columns, score_type=score_type) for score_type in score_types}
-        predicted = {score_type: values for score_type, (values, _) in fits.items()}
-        margin = ROUNDING * np.sum(returns[N_FIRST:] ** 2)
-        errors = {key: float(np.sum((returns[N_FIRST:] - values) ** 2) + margin) for key, values in predicted.items()}
-        score_type = score_types[0]
+        fits = [predict(columns, score_type=score_type) for score_type in score_types]
+        index, estimate = 0, None
         if len(score_types) > 1:
-            as_average, as_sum = jnp.asarray(predicted[ScoreType.AVERAGE]), jnp.asarray(predicted[ScoreType.SUM])
-            is_average = is_better(jnp.asarray(returns[N_FIRST:]), as_average, as_sum, jnp.ones(len(as_sum), bool))
-            score_type = ScoreType(int(is_average))
-        length_r2 = None
-        if score_type is ScoreType.SUM and lengths_differ:
-            lengths_alone = np.hstack([np.zeros_like(features), 1 / length[:, None], np.zeros_like(one_hot)])
-            length_r2 = r_squared(returns[N_FIRST:], predict(lengths_alone, score_type=ScoreType.SUM)[0])[0]
-        level_r2 = None
+            predictions = Predictions(
+                n_episodes=jnp.asarray(float(len(later_returns))),
+                returns=jnp.asarray(later_returns),
+                predicted=jnp.stack([predicted for predicted, _ in fits], axis=1),
+                level=jnp.zeros(len(later_returns), int),
+            )
+            index = int(is_better(predictions, ScoreType.AVERAGE, ScoreType.SUM))
+            estimate = compare_score_types(predictions, score_types, index)
+        score_type, (predicted, weight) = score_types[index], fits[index]
+        length_r2 = level_r2 = None
+        if score_type is ScoreType.SUM and not fixed_length:
+            lengths_alone = np.where(column == n_features, columns, 0)
+            length_r2 = r_squared(later_returns, predict(lengths_alone, score_type=score_type)[0])[0]
         if level is not None:
-            levels_alone = np.hstack([np.zeros_like(features), 1 / length[:, None], one_hot])
-            level_r2 = r_squared(returns[N_FIRST:], predict(levels_alone, score_type=score_type)[0])[0]
-        start_value = fits[score_type][1][int(basis.is_factor_feature.sum())]
+            levels_alone = np.where(column >= n_features, columns, 0)
+            level_r2 = r_squared(later_returns, predict(levels_alone, score_type=score_type)[0])[0]
+        start_value = weight[basis.n_factor_features]
         explained = jax.tree.map(np.asarray, _explain(state, score_type, start_value))
-
-    r2, r2_error = r_squared(returns[N_FIRST:], predicted[score_type])
-    estimate = compare_score_types(errors, score_type) if len(score_types) > 1 else None
+    r2, r2_error = r_squared(later_returns, predicted)
     return FactorAssessment(r2, r2_error, length_r2, level_r2, score_type=estimate, explanation=explained)
 
 
@@ -161,12 +160,9 @@ def predict_returns(
 ) -> tuple[Float[np.ndarray, " later_episodes"], Float[np.ndarray, " used_columns"]]:
     """Return R_hat of all episodes but the first `N_FIRST`, each by a fit to episodes before it, and the weights of the last fit.
 
-    Call this within `float64()`.
-
-    `columns` are the mean features of each episode, 1/T, and which level it has. Only functions of factors, and levels, are used.
+    Call this within `float64()`. `columns` are the mean features of each episode, 1/T, and which level it has. Functions of raw features
+    are not used.
     """
-    if score_type == ScoreType.AVERAGE:  # it has a constant part already
-        columns = np.where(np.arange(columns.shape[1]) == basis.n_features, 0, columns)
     features, group_index = columns[:, _is_used(basis)], basis.column_group_index[_is_used(basis)]
     state = evidence.empty_statistics(len(group_index)), evidence.init_posterior(group_index)
     statistics, posterior = jax.tree.map(lambda leaf: leaf.astype(float), state)
@@ -199,7 +195,8 @@ def _add_and_fit(
 ) -> tuple[SufficientStatistics, Posterior]:
     statistics = evidence.add_episodes(statistics, features, returns, length)
     group_index = basis.column_group_index[_is_used(basis)]
-    return statistics, evidence.fit(statistics, score_type, group_index, posterior, MAX_EVIDENCE_ROUNDS)
+    sums = drop_start_value(statistics, basis.n_factor_features, score_type)
+    return statistics, evidence.fit(sums, score_type, group_index, posterior, MAX_EVIDENCE_ROUNDS)
 
 
 def _growing_blocks(count: int) -> Iterator[tuple[int, int]]:

@@ -17,9 +17,8 @@ sigmoid, with the gradient of the soft one (Jang, Gu and Poole, 2017):
 softplus(d) is -log of the probability that C is 0: it asks for sparsity. As long as the loss at the left of a line exceeds a
 threshold (1e-4 of the rewards, 1/2 of the next states), the sparsity at its right is left out.
 
-The equations and settings are those of the authors' code (github.com/ReedZyd/grd_neurips, commit 406b010). The text of the paper
-could not be read. docs/reference/differences.md lists the differences. Masks of next states do not change r_hat. In the paper they
-choose the entries that the policy sees, which is not done here.
+Masks of next states do not change r_hat. In the paper they choose the entries that the policy sees, which is not done here. The
+equations and settings are those of the authors' code, not of the paper; docs/reference/differences.md lists the differences.
 """
 
 import equinox as eqx
@@ -56,7 +55,6 @@ def sample_mask(logits: Float[Array, "*edges 2"], key: PRNGKeyArray) -> Float[Ar
 
 
 def _init_logits(*shape: int, key: PRNGKeyArray) -> Float[Array, "*edges 2"]:
-    """Return logits as the authors' code initialises them: uniform, by Glorot and Bengio's rule for the last two axes."""
     return jax.nn.initializers.glorot_uniform(batch_axis=tuple(range(len(shape) - 1)))(key, (*shape, 2))
 
 
@@ -103,9 +101,8 @@ class GRD(eqx.Module):
         return self.reward_model(jnp.concatenate([state_mask * state, action_mask * action], axis=-1))[..., 0]
 
     def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
-        """Return f of the causes. It has no noise and no penalty."""
-        r_hat = self._reward(inputs, causes(self.state_reward), causes(self.action_reward))
-        return DecoderOutput(r_hat, jnp.zeros_like(r_hat))
+        """Return f of the causes."""
+        return DecoderOutput(self._reward(inputs, causes(self.state_reward), causes(self.action_reward)))
 
     def next_state_log_density(
         self,

@@ -35,7 +35,7 @@ class InputNames:
     def __post_init__(self) -> None:
         for field in ("names", "names_of_many_agents"):
             names = getattr(self, field) or ()
-            if isinstance(names, str) or not set(names) <= set(_NAMES):
+            if not isinstance(names, tuple | list) or not set(names) <= set(_NAMES):
                 raise LareError(
                     f"the inputs of a decoder are a tuple of names among {', '.join(_NAMES)}, and was given {names!r}"
                 )
@@ -50,11 +50,11 @@ class InputNames:
         """Return the names of the inputs, with `scored_observation` replaced by the observations that a task names."""
         names = self.names if single_agent or self.names_of_many_agents is None else self.names_of_many_agents
         scored = select_states(scored_observation, "observation", "next_observation")
-        return tuple(name for group in names for name in (scored if group == "scored_observation" else [group]))
+        resolved = (name for group in names for name in (scored if group == "scored_observation" else [group]))
+        return tuple(dict.fromkeys(resolved))  # a name twice is the same input
 
     @property
     def has_factors(self) -> bool:
-        """Whether the inputs contain the factors of a latent function."""
         return "factors" in self.names
 
     @property

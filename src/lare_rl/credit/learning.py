@@ -18,12 +18,11 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import closed_form, decoder_state, evidence, logistic
-from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
 from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
-from lare_rl.credit.prequential import Predictions, add_predictions, squared_errors
-from lare_rl.credit.score_type import ROUNDING, ScoreType, ScoreTypeEstimate, compare_score_types, is_better
+from lare_rl.credit.prequential import Predictions, add_predictions
+from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate, compare_score_types, is_better, score_type_errors
 from lare_rl.credit.spec import CreditSpec
 
 __all__ = [
@@ -65,7 +64,7 @@ def predict(state: DecoderState, episodes: CreditBatch, spec: CreditSpec) -> Dec
     There may be at most as many episodes as the window of `state.predictions` has. Episodes with mask 0 are ignored, and before the
     first fit all of them.
     """
-    is_new, returns = episodes.mask > 0, episodes.mean_reward * episodes.length
+    is_new, returns = episodes.mask > 0, episodes.returns
     predicted = predicted_returns(state, episodes, spec)
     predicted = predicted + decoder_state.level_returns(state, episodes.level, episodes.length)
     closed = state.closed_form
@@ -86,8 +85,8 @@ def _predict_by_score_type(closed: ClosedForm, episodes: CreditBatch) -> Float[A
     decoder, columns = closed.decoder, _columns(closed.decoder, episodes)
     n_linear = len(closed.posterior.bias)
     weights = jnp.concatenate([decoder.weight, closed.intercept], axis=1)
-    linear_columns = jnp.delete(columns, _start_column(decoder.basis), axis=1)
-    predicted = linear_columns @ weights[:n_linear].T + decoder.bias[:n_linear]
+    linear = jnp.delete(columns, decoder.basis.n_features, axis=1) if decoder.basis.start_value else columns
+    predicted = linear @ weights[:n_linear].T + decoder.bias[:n_linear]
     units = jnp.stack([episodes.length, jnp.ones_like(episodes.length)], axis=1)
     predicted = predicted * units[:, :n_linear] + closed.start_value[:n_linear]
     if closed.log_odds is None:
@@ -100,18 +99,16 @@ def _episode_sums(
     decoder: LinearDecoder, columns: Float[Array, "episodes columns"], episodes: CreditBatch
 ) -> Float[Array, "episodes columns"]:
     """Return the sums of the features of each episode, from their means, and which level it has."""
-    index = np.arange(columns.shape[1])
-    is_feature, is_start = index < decoder.basis.n_features, np.isin(index, _start_column(decoder.basis))
-    return columns * jnp.where(is_feature, episodes.length[:, None], ~is_start)
+    index, basis = np.arange(columns.shape[1]), decoder.basis
+    is_feature, is_level = index < basis.n_features, index >= basis.n_columns - basis.n_levels
+    return columns * jnp.where(is_feature, episodes.length[:, None], is_level)  # without 1/T
 
 
 def predicted_returns(state: DecoderState, episodes: CreditBatch, spec: CreditSpec) -> Float[Array, " episodes"]:
     """Return the sum of each episode's proxy rewards, which are the mean over the agents that are alive."""
-    n_episodes = len(episodes.length)
-    row_length = episodes.length[jnp.clip(episodes.episode_index, 0, n_episodes - 1)]
-    r_hat = decoder_state.decoder_rewards(state, episodes.inputs, spec, row_length)
+    r_hat = decoder_state.decoder_rewards(state, episodes.inputs, spec, episodes.length[episodes.valid_index])
     team_r_hat = decoder_state.agent_mean(r_hat, episodes.alive)
-    return jax.ops.segment_sum(team_r_hat, episodes.episode_index, n_episodes)
+    return jax.ops.segment_sum(team_r_hat, episodes.episode_index, len(episodes.length))
 
 
 def mean_features(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "episodes features"]:
@@ -137,11 +134,10 @@ def _team_features(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array
 
 def _prefix_columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "rows columns"]:
     """Return the sum of the features up to each step, the number of these steps, and which level the episode has."""
-    features, n_rows = _team_features(decoder, episodes).astype(float), len(episodes.episode_index)
-    row = jnp.arange(n_rows)
-    index = jnp.minimum(episodes.episode_index, len(episodes.length) - 1)
+    features, index = _team_features(decoder, episodes).astype(float), episodes.valid_index
+    row = jnp.arange(len(features))
     first = jax.ops.segment_min(row, episodes.episode_index, len(episodes.length))[index]
-    first = jnp.clip(first, 0, n_rows - 1)
+    first = jnp.clip(first, 0, len(features) - 1)  # an episode without rows has a very large one
     total = jnp.cumsum(features, axis=0)
     before = total - features
     columns = jnp.concatenate([total - before[first], (row - first + 1.0)[:, None]], axis=1)
@@ -156,15 +152,9 @@ def _columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "epi
     return _append_levels(columns, episodes.level, decoder.basis.n_levels)
 
 
-def _start_column(basis: Basis) -> Int[np.ndarray, " columns"]:
-    """Return the index of the column 1/T, if there is one."""
-    return np.arange(basis.n_features, basis.n_features + basis.start_value)
-
-
 def _append_levels(
     columns: Float[Array, "rows columns"], level: Int[Array, " rows"] | None, n_levels: int
 ) -> Float[Array, "rows all_columns"]:
-    """Append which level the episode of each row has, if there are levels."""
     if level is None or not n_levels:
         return columns
     return jnp.concatenate([columns, jax.nn.one_hot(level, n_levels, dtype=columns.dtype)], axis=1)
@@ -172,19 +162,17 @@ def _append_levels(
 
 def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     """Add whole episodes to the sums, in float64 if that is enabled. Episodes whose mask is 0 are ignored."""
-    statistics = closed_form.to_float64(closed.sufficient_statistics)
-    returns, mask = episodes.mean_reward * episodes.length, episodes.mask > 0
+    statistics, log_odds = closed_form.to_float64(closed.sufficient_statistics), closed.log_odds
+    returns, mask = episodes.returns, episodes.mask > 0
     if closed.decoder.basis.prefixes:
-        index = jnp.minimum(episodes.episode_index, len(mask) - 1)
         columns, is_step = _prefix_columns(closed.decoder, episodes), decoder_state.step_rows(episodes)
-        statistics = evidence.add_prefixes(statistics, columns, returns[index], is_step, jnp.sum(mask))
-        return closed._replace(sufficient_statistics=closed_form.split_double(statistics))
-    columns = _columns(closed.decoder, episodes)
-    statistics = evidence.add_episodes(statistics, columns, returns, jnp.where(mask, episodes.length, 0))
-    log_odds = closed.log_odds
-    if log_odds is not None:
-        sums = _episode_sums(closed.decoder, columns, episodes)
-        log_odds = logistic.add_episodes(log_odds, sums, returns, mask)
+        statistics = evidence.add_prefixes(statistics, columns, returns[episodes.valid_index], is_step, jnp.sum(mask))
+    else:
+        columns = _columns(closed.decoder, episodes)
+        statistics = evidence.add_episodes(statistics, columns, returns, jnp.where(mask, episodes.length, 0))
+        if log_odds is not None:
+            sums = _episode_sums(closed.decoder, columns, episodes)
+            log_odds = logistic.add_episodes(log_odds, sums, returns, mask)
     return closed._replace(sufficient_statistics=closed_form.split_double(statistics), log_odds=log_odds)
 
 
@@ -196,8 +184,7 @@ def fit_closed_form(state: DecoderState, spec: CreditSpec, *, batched: bool = Fa
     closed, score_types = state.closed_form, spec.score_types
     if closed is None:
         return state
-    is_signed = spec.method.fit is Fit.SIGNS
-    if is_signed:
+    if spec.method.fit is Fit.SIGNS:
         closed = closed_form.fit_signs(closed)
     else:
         closed = closed_form.fit(closed, score_types, fixed_length=spec.fixed_length, batched=batched)
@@ -214,12 +201,12 @@ def _choose_score_type(
     state: DecoderState, predictions: Predictions, score_types: tuple[ScoreType, ...]
 ) -> DecoderState:
     """Choose the type that predicts returns best. An average must do so beyond chance."""
-    errors, is_log_odds, is_average = _score_type_errors(predictions), jnp.asarray(False), state.is_average
+    is_log_odds, is_average = jnp.asarray(False), state.is_average
     if score_types[-1] == ScoreType.LOG_ODDS:
-        is_log_odds, errors = errors[-1] < jnp.min(errors[:-1]), errors[:-1]
-    if len(errors) > 1:
-        as_sum, as_average = predictions.predicted[:, 0], predictions.predicted[:, 1]
-        is_average = is_better(predictions.returns, as_average, as_sum, predictions.valid) & ~is_log_odds
+        errors = score_type_errors(predictions)
+        is_log_odds = errors[-1] < jnp.min(errors[:-1])
+    if ScoreType.AVERAGE in score_types:
+        is_average = is_better(predictions, ScoreType.AVERAGE, ScoreType.SUM) & ~is_log_odds
     return state._replace(is_average=is_average, is_log_odds=is_log_odds)
 
 
@@ -230,24 +217,16 @@ def estimate_score_type(state: DecoderState, spec: CreditSpec) -> ScoreTypeEstim
     """
     if state.score_type_predictions is None:
         return None
-    errors = np.asarray(_score_type_errors(state.score_type_predictions))
+    errors = np.asarray(score_type_errors(state.score_type_predictions))
     index = int(decoder_state.score_type_index(state, len(errors)))
     if np.allclose(errors[index], np.delete(errors, index), rtol=1e-3):
         return None
-    types = spec.score_types
-    return compare_score_types(dict(zip(types, errors.tolist(), strict=True)), types[index])
+    return compare_score_types(state.score_type_predictions, spec.score_types, index)
 
 
 def looks_binary(state: DecoderState, spec: CreditSpec) -> bool:
     """Return whether the last returns have two values, and the method could fit their odds, but does not."""
-    is_fitted_otherwise = spec.has_closed_form and ScoreType.LOG_ODDS not in spec.score_types
-    if not is_fitted_otherwise or "score" not in spec.method.settings:
+    if spec.method.fit is not Fit.EVIDENCE or ScoreType.LOG_ODDS in spec.score_types:
         return False
     n_returns = min(int(state.predictions.n_episodes), len(state.predictions.returns))
     return n_returns >= MIN_BINARY_RETURNS and len(np.unique(np.asarray(state.predictions.returns)[:n_returns])) == 2
-
-
-@jax.jit
-def _score_type_errors(predictions: Predictions) -> Float[Array, " score_types"]:
-    """Return the squared error of each type's predictions, plus a margin for rounding."""
-    return squared_errors(predictions) + ROUNDING * jnp.sum(predictions.returns**2)

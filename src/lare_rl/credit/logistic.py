@@ -11,8 +11,7 @@ Jordan, *Bayesian parameter estimation via variational methods*, Statistics and 
 
 Under the bound, w is the weight of a regression of z on x in which episode k has the noise precision lambda_k. So each round is a
 round of `evidence.py` with known noise, and none makes the bound worse. Unlike Laplace's approximation it needs no step size, even
-if the episodes can be separated. `turns/logistic.py` keeps Laplace's approximation, because it leaves out single rollouts by a step of
-Newton's method, which needs the curvature of the likelihood, not of the bound.
+if the episodes can be separated.
 
 The fit reads the last `WINDOW` episodes, because it needs their features again in each round, and not only sums over them.
 
@@ -90,7 +89,7 @@ def add_episodes(
     )
 
 
-def _values(state: LogOddsFit) -> tuple[Bool[Array, " window"], Float[Array, ""], Float[Array, ""]]:
+def _valid_range(state: LogOddsFit) -> tuple[Bool[Array, " window"], Float[Array, ""], Float[Array, ""]]:
     """Return which slots have an episode, and the lowest and the highest return."""
     valid = jnp.arange(WINDOW) < state.n_episodes
     low = jnp.min(jnp.where(valid, state.returns, jnp.inf))
@@ -106,7 +105,7 @@ def fit(state: LogOddsFit, alpha_index: AlphaIndex, max_rounds: int | Int[Array,
 
     Returns are divided into won and lost halfway between the lowest and the highest. While all are equal, nothing changes.
     """
-    valid, low, high = _values(state)
+    valid, low, high = _valid_range(state)
     n_episodes = jnp.maximum(jnp.sum(valid), 1)
     x = jnp.where(valid[:, None], state.columns, 0).astype(float)
     won = (state.returns > (low + high) / 2).astype(float)
@@ -161,13 +160,13 @@ def fit(state: LogOddsFit, alpha_index: AlphaIndex, max_rounds: int | Int[Array,
 
 def predict(state: LogOddsFit, columns: Float[Array, "episodes columns"]) -> Float[Array, " episodes"]:
     """Return the expected return of episodes, by the sums of their features. It is NaN without a fit."""
-    _, low, high = _values(state)
+    _, low, high = _valid_range(state)
     return low + (high - low) * jax.nn.sigmoid(state.posterior.bias + columns @ state.posterior.weight)
 
 
 def to_returns(state: LogOddsFit) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return a and c. The regression is on the expected returns of the episodes, which have no noise."""
-    valid, _, _ = _values(state)
+    """Return a and c of R = a + c w . x, by a regression of the expected returns of the episodes, which have no noise."""
+    valid, _, _ = _valid_range(state)
     n_episodes = jnp.maximum(jnp.sum(valid), 1)
     log_odds = jnp.where(valid, state.posterior.bias + state.columns @ state.posterior.weight, 0)
     expected = jnp.where(valid, predict(state, state.columns), 0)

@@ -3,8 +3,8 @@
 Each loss maps a decoder's outputs for some episodes to one number, which is minimised. Notation: r_hat is the proxy reward of
 a step, T the length of an episode, R its return, K the number of its sampled steps, B the number of episodes in a batch.
 
-The published code fits R/T, the mean reward of a step, rather than R (Eq. 6 of the LaRe paper). R/T is far better conditioned,
-and has the same minimiser if all episodes have the same length. `sum_form` fits R.
+The target is R/T, as in LaRe's published code, or R with `sum_form` (Eq. 6 of the LaRe paper). R/T is far better conditioned, and has
+the same minimiser if all episodes have the same length.
 """
 
 import jax
@@ -102,14 +102,14 @@ def step_loss(
 ) -> Float[Array, " episodes"]:
     """Return the mean squared error of a step model over the steps of each episode, for Diaster, RUDDER and RBT.
 
-    A recurrent model reads an episode from its beginning, so that it cannot judge a single stored step. An algorithm that samples
-    transitions needs just that. The step model therefore learns the mean of the differences from the step alone:
+    An algorithm that samples transitions needs rewards of single stored steps, which a model of whole episodes cannot give. The step
+    model learns the mean of the differences from the step alone:
 
         (r_hat(x_t) - L (F_t - F_{t-1}))^2,    F_{-1} = 0
 
-    `prefix` is F_t, what the recurrent model gives to the steps 0 to t; no gradient goes to it. It is in units of L times the scale,
-    where L is the number of steps of the longest episode, so that it is at most about 1. The step model is in units of the scale, the
-    root mean square of R/T.
+    `prefix` is F_t, the sum of the rewards of the steps 0 to t by the model of episodes; no gradient goes to it. It is in units of L
+    times the scale, where L is the number of steps of the longest episode and the scale is the root mean square of R/T. The step
+    model is in units of the scale.
     """
     max_steps = inputs.shape[1]
     target = max_steps * jnp.diff(jax.lax.stop_gradient(prefix), axis=1, prepend=0)

@@ -9,14 +9,11 @@ means of all other steps leave a reward for the step, whose likelihood is maximi
 The mean over t is the loss of an episode (`losses.py`). With a constant sigma it is the squared error of RD, or of RRD if the sum is
 estimated from K sampled steps, as here. The algorithm is trained on mu_t.
 
-Only the abstract could be read, and these equations have all that it says: a distribution for each step whose parameters depend on
-state and action, leave-one-out, the whole trajectory, an uncertainty term, and the squared error as the case of a fixed uncertainty.
-Whether the paper takes the means of the other steps or samples of them is not known here. Version 2 of the paper is another method,
-with a Gaussian process.
+The equations follow from the abstract of the paper (docs/reference/differences.md). Its version 2 is another method, with a Gaussian
+process.
 """
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput
@@ -41,5 +38,4 @@ class LRR(eqx.Module):
 
     def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
         output = self.mlp(inputs)
-        log_std = bound_log_std(output[..., 1])
-        return DecoderOutput(self.output_scale * output[..., 0], jnp.zeros_like(log_std), log_std)
+        return DecoderOutput(self.output_scale * output[..., 0], log_std=bound_log_std(output[..., 1]))

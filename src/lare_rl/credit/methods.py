@@ -9,6 +9,7 @@ return, which is the reward of the last step. A method works for a single agent 
 
 from dataclasses import dataclass
 from enum import StrEnum
+from types import NoneType
 from typing import Literal
 
 from lare_rl.credit.decoder_settings import CreditSettings
@@ -93,7 +94,6 @@ class Method:
     summary: str
     source: str
     inputs: InputNames | None = None
-    """What the decoder reads."""
     fit: Fit | None = None
     decoder: str = "step"
     """The name of a registered decoder."""
@@ -102,17 +102,15 @@ class Method:
     """Whether all agents get the mean of their proxy rewards: credit over time, but not among agents."""
 
     def __post_init__(self) -> None:
-        examples = {
-            InputNames: 'InputNames(("observation", "action"))',
-            Fit: "Fit.ALL_STEPS",
-            Reward: "Reward.PROXY",
-            str: '"step", a registered decoder',
-        }
-        values = self.inputs, self.fit, self.reward, self.decoder
-        for value, (kind, example) in zip(values, examples.items(), strict=True):
-            if not isinstance(value, kind | None):
+        for value, kinds, example in (
+            (self.inputs, (InputNames, NoneType), 'InputNames(("observation", "action"))'),
+            (self.fit, (Fit, NoneType), "Fit.ALL_STEPS"),
+            (self.reward, (Reward,), "Reward.PROXY"),
+            (self.decoder, (str,), '"step", a registered decoder'),
+        ):
+            if not isinstance(value, kinds):
                 raise LareError(
-                    f"method {self.name}: {short_repr(value)} is no {kind.__name__}: write {example}, for example"
+                    f"method {self.name}: {short_repr(value)} is no {kinds[0].__name__}: write {example}, for example"
                 )
 
     @property
@@ -163,10 +161,6 @@ class Method:
         names = self.fit.settings | self.decoder_kind.settings
         return names - {"exact"} if self.decoder_kind.pays_shares else names  # shares always add up to the return
 
-    def is_exact(self, exact: str) -> bool:
-        """Return whether the setting `exact` corrects proxy rewards to add up to the return."""
-        return exact in ("last", "spread") and "exact" in self.settings
-
     def choose_exact(self, exact: str) -> str:
         """Return how proxy rewards are made exact, by the setting `exact`."""
         if exact != "auto":
@@ -180,7 +174,6 @@ class Method:
 
     @property
     def multi_agent_only(self) -> bool:
-        """Whether it needs several agents."""
         return self.shared or self.decoder_kind.whole_episodes
 
     @property

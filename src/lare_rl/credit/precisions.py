@@ -36,9 +36,8 @@ JITTER = 1e-10
 TOLERANCE = 1e-3
 """The iteration to the fixed point ends when a round changes the log evidence by less than this."""
 MIN_VARIATION = 1e-5
-"""A feature is taken to be constant if its standard deviation between cases is below this fraction of sqrt(1 + mean^2). So features must
-have a size of about 1, or more. The rounding errors of a constant in float32 are smaller. An episode's mean of the time is constant, for
-example, if all episodes are equally long. A weight for it would be the quotient of two rounding errors."""
+"""A feature is constant if its standard deviation between cases is below this fraction of sqrt(1 + mean^2), as the mean time of equally
+long episodes is: a weight for it would be the quotient of two rounding errors. So features must have a size of about 1, or more."""
 MANY_EPISODES_PER_FEATURE = 2
 """With fewer episodes for each feature, the evidence may have several maxima (`evidence.fit`)."""
 MIN_NOISE = 1e-10

@@ -39,7 +39,7 @@ SEGMENT_WINDOW = 256
 MIN_R2_EPISODES = 8
 """With fewer episodes, R^2 is NaN."""
 LITTLE_R2 = 0.1
-"""Proxy rewards explain next to nothing of the score if R^2 of the returns is lower."""
+"""Proxy rewards, or factors, explain next to nothing of the score if R^2 of the returns is lower."""
 
 
 class Predictions(NamedTuple):

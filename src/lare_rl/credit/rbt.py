@@ -10,8 +10,7 @@ The transformer is GPT-2 (Radford et al., 2019): x + attention(LN(x)), then x + 
 all activations dropped in an update. It cannot judge a single stored step, so that a step model learns r_t from s_t and a_t: see
 `losses.step_loss`. r_t is in units of the scale, the root mean square of R/T.
 
-The equations and settings are those of the authors' code (github.com/Tang-Yuting/RLBR, commit fac908f); of the text of the paper only
-the abstract could be read. docs/reference/differences.md lists the differences.
+The equations and settings are those of the authors' code, not of the paper; docs/reference/differences.md lists the differences.
 """
 
 from functools import partial
@@ -21,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from lare_rl.credit.decoder_network import DecoderOutput
+from lare_rl.credit.decoder_network import DecoderOutput, split_key
 from lare_rl.credit.decoders import RBT_STEPS
 from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, batch_mean, is_step, step_loss
 from lare_rl.credit.spec import CreditSpec
@@ -60,7 +59,7 @@ class Block(eqx.Module):
     def __call__(
         self, x: Float[Array, "episodes tokens size"], key: PRNGKeyArray | None
     ) -> Float[Array, "episodes tokens size"]:
-        keys = (None,) * 3 if key is None else jax.random.split(key, 3)
+        keys = split_key(key, 3)
         query, projected_key, value = jnp.split(self.projections(self.norms[0](x))[..., None, :], 3, axis=-1)
         attended = attend(query, projected_key, value, causal_mask(x.shape[1]), partial(_dropout, key=keys[0]))
         x = x + _dropout(self.merge(attended), keys[1])
@@ -108,15 +107,14 @@ class RBT(eqx.Module):
         return jnp.concatenate(self._split(inputs)[:2], axis=-1)
 
     def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
-        """Return the output of the step model, which has no noise and no penalty."""
-        return DecoderOutput(self.step_model(self._step_inputs(inputs))[..., 0], jnp.zeros(inputs.shape[:-1]))
+        return DecoderOutput(self.step_model(self._step_inputs(inputs))[..., 0])
 
     def bag_rewards(
         self, inputs: Float[Array, "bags steps inputs"], valid: Bool[Array, "bags steps"], key: PRNGKeyArray | None
     ) -> tuple[Float[Array, "bags steps"], Float[Array, "bags steps states"]]:
         """Return r_t and the predicted next states of each bag. Without a key, no activation is dropped."""
         state, action, _ = self._split(inputs)
-        keys = (None,) * (1 + LAYERS) if key is None else jax.random.split(key, 1 + LAYERS)
+        keys = split_key(key, 1 + LAYERS)
         position = _positions(inputs.shape[1], self.embed_state.weight.shape[1])
         tokens = jnp.stack([self.embed_action(action) + position, self.embed_state(state) + position], axis=2)
         x = self.first_norm(tokens.reshape(len(inputs), -1, tokens.shape[-1]))

@@ -11,7 +11,6 @@ evidence, so the iteration starts from the precisions of the groups, and its res
 `MIN_GAIN` for each additional precision. Otherwise the fit is that of the groups.
 """
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
@@ -33,27 +32,24 @@ def fit(
     group_index: AlphaIndex,
     strength_index: AlphaIndex,
     earlier_groups: Posterior,
-    earlier: Posterior,
+    earlier_strengths: Posterior,
     max_rounds: int,
     *,
     batched: bool = False,
 ) -> tuple[Posterior, Posterior]:
     """Return the fit by groups, and the fit with a precision for each strength, whether it is better than that by groups or not.
 
-    Both are the same if each group has one strength. The arguments are those of `evidence.fit`, and the index of each feature's strength.
-    `earlier_groups` and `earlier` are earlier results, or `evidence.init_posterior`. The iteration for the strengths starts from the
-    precisions of the groups. With `Regression.has_many_episodes`, it continues from `earlier`.
+    Both are the same if each group has one strength. The other arguments are those of `evidence.fit`. `earlier_groups` and
+    `earlier_strengths` are earlier results, or `evidence.init_posterior`. The iteration for the strengths starts from the precisions of
+    the groups or, with `Regression.has_many_episodes`, from `earlier_strengths`.
     """
     groups = evidence.fit(statistics, score_type, group_index, earlier_groups, max_rounds, batched=batched)
     if np.array_equal(group_index, strength_index):
         return groups, groups
     start = expand_groups(groups, group_index, strength_index)
     problem = evidence.regression(statistics, score_type, strength_index)
-    continues = problem.has_many_episodes & earlier.has_fit
-    alpha, beta = (
-        jnp.where(continues, old, new) for old, new in ((earlier.alpha, start.alpha), (earlier.beta, start.beta))
-    )
-    posterior = evidence.fixed_point(problem, alpha, beta, max_rounds)
+    initial = masks.select(problem.has_many_episodes & earlier_strengths.has_fit, earlier_strengths, start)
+    posterior = evidence.fixed_point(problem, initial.alpha, initial.beta, max_rounds)
     return groups, evidence.unscale(statistics, problem, posterior, fallback=start)
 
 

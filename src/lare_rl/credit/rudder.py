@@ -10,9 +10,7 @@ The LSTM has no forget gate and no output gate, its cell reads the step alone, a
 the loss is the continuous prediction, the auxiliary task: it moves reward to the step after which the return can be told. The
 last term of r_t divides the error of the last prediction evenly, so that the rewards add up to R.
 
-The equations are those of the authors' code: ml-jku/rudder-demonstration-code (d728413) for the cell, its initial weights and the
-loss, widmi/rudder-a-practical-tutorial (06155b4) for the division of the error. The numbers of the paper's equations were not
-compared.
+The equations are those of the authors' code; docs/reference/differences.md lists the differences.
 
 g is in units of L times the scale, where L is the number of steps of the longest episode. h grows with the steps, and the division by
 L, which is not published, keeps g of the size of its target from the first update. A step model learns r_t from the step alone: see
@@ -67,8 +65,7 @@ class RUDDER(eqx.Module):
         self.step_model = MLP(n_inputs, hidden, 1, key=step_key)
 
     def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
-        """Return the output of the step model, which has no noise and no penalty."""
-        return DecoderOutput(self.step_model(inputs)[..., 0], jnp.zeros(inputs.shape[:-1]))
+        return DecoderOutput(self.step_model(inputs)[..., 0])
 
     def predictions(self, inputs: EpisodeInputs) -> Float[Array, "episodes steps"]:
         """Return g after each step."""

@@ -1,25 +1,26 @@
 """How the score of an episode follows from its steps: a sum over them, an average, or a success whose odds they change."""
 
-from collections.abc import Mapping
 from enum import IntEnum
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from lare_rl.credit.prequential import Predictions, squared_errors
+
 __all__ = [
-    "MAX_ERROR_RATIO",
-    "ROUNDING",
     "ScoreType",
     "ScoreTypeEstimate",
     "compare_score_types",
     "is_better",
+    "score_type_errors",
     "score_types_to_fit",
 ]
 
 MAX_ERROR_RATIO = 0.95
-"""Predictions of one type are better if their squared error is below this fraction of that of another type. If all episodes are equally
-long, both errors are equal except for rounding."""
+"""Predictions of one type are better if their squared error is below this fraction of that of another type."""
 MIN_Z = 2.0
 """The difference of the errors must also exceed this number of its standard errors. Otherwise a single episode could decide."""
 ROUNDING = 1e-6
@@ -56,20 +57,18 @@ def score_types_to_fit(score: str, fixed_length: bool, *, allow_log_odds: bool) 
         allow_log_odds: whether a score may be log odds. Decoders that are fitted in closed form allow it.
     """
     if score in ("sum", "average"):
-        return (ScoreType.SUM,) if score == "sum" else (ScoreType.AVERAGE,)
+        return (ScoreType[score.upper()],)
     linear = (ScoreType.SUM,) if fixed_length else (ScoreType.SUM, ScoreType.AVERAGE)
     return (*linear, ScoreType.LOG_ODDS) if score == "binary" and allow_log_odds else linear
 
 
-def is_better(
-    returns: Float[Array, " episodes"],
-    predicted: Float[Array, " episodes"],
-    rival: Float[Array, " episodes"],
-    valid: Bool[Array, " episodes"],
-) -> Bool[Array, ""]:
-    """Return whether `predicted` is closer to the returns than `rival` in the mean of the squared error, beyond chance."""
-    rounding = ROUNDING * returns**2
-    error, rival_error = (jnp.where(valid, (returns - x) ** 2 + rounding, 0) for x in (predicted, rival))
+def is_better(predictions: Predictions, index: int, rival: int) -> Bool[Array, ""]:
+    """Return whether the decoder at `index` predicts returns with a smaller squared error than the one at `rival`, beyond chance."""
+    returns, valid = predictions.returns, predictions.valid
+    error, rival_error = (
+        jnp.where(valid, (returns - predictions.predicted[:, i]) ** 2 + ROUNDING * returns**2, 0)
+        for i in (index, rival)
+    )
     n, difference = jnp.sum(valid), rival_error - error
     mean = jnp.sum(difference) / jnp.maximum(n, 1)
     variance = jnp.sum(jnp.where(valid, (difference - mean) ** 2, 0)) / jnp.maximum(n - 1, 1)
@@ -77,7 +76,15 @@ def is_better(
     return is_beyond_chance & (jnp.sum(error) < MAX_ERROR_RATIO * jnp.sum(rival_error))
 
 
-def compare_score_types(errors: Mapping[ScoreType, float], chosen: ScoreType) -> ScoreTypeEstimate:
-    """Compare the chosen type with the others, by the squared error of each type's predictions of returns."""
-    rival = min((other for other in errors if other != chosen), key=lambda other: errors[other])
-    return ScoreTypeEstimate(chosen, errors[chosen] < MAX_ERROR_RATIO * errors[rival], rival)
+@jax.jit
+def score_type_errors(predictions: Predictions) -> Float[Array, " score_types"]:
+    """Return the squared error of each type's predictions, plus a margin for rounding."""
+    return squared_errors(predictions) + ROUNDING * jnp.sum(predictions.returns**2)
+
+
+def compare_score_types(predictions: Predictions, score_types: tuple[ScoreType, ...], index: int) -> ScoreTypeEstimate:
+    """Compare the score type at `index`, which is used, with the others by their predictions of returns."""
+    errors = np.array(score_type_errors(predictions))
+    errors[index] = np.inf
+    rival = int(np.argmin(errors))
+    return ScoreTypeEstimate(score_types[index], bool(is_better(predictions, index, rival)), score_types[rival])

@@ -28,9 +28,7 @@ class CreditSpec:
     """The size of an observation or, for credit to whole teams, of the global state."""
     action_size: int
     scored_observation: ScoredObservation = "after"
-    """Which observations the task names."""
     single_agent: bool
-    """Whether the task has a single agent."""
     agents: int
     """The number of proxy rewards of a step."""
     max_steps: int
@@ -38,7 +36,6 @@ class CreditSpec:
     fixed_length: bool = False
     """Whether all episodes have the same length. A sum and an average are then the same."""
     payments: PaymentRule = PAID_AT_END
-    """When the environment pays."""
     has_groups: bool = False
     """Whether episodes may belong to groups, whose returns differ in level."""
     scale_rewards: bool = False
@@ -47,7 +44,7 @@ class CreditSpec:
     @property
     def is_exact(self) -> bool:
         """Whether the proxy rewards of an episode are corrected to add up to its return."""
-        return self.method.is_exact(self.settings.exact)
+        return self.settings.exact in ("last", "spread") and "exact" in self.method.settings
 
     @property
     def window(self) -> int:
@@ -118,7 +115,6 @@ class CreditSpec:
 
     @property
     def n_inputs(self) -> int:
-        """The number of inputs of a step."""
         return self.basis.n_inputs
 
     @property

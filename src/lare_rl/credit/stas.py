@@ -5,10 +5,11 @@ The mean over the coalitions approximates the Shapley value of an agent:
 
     r_hat_{i,t} = w . mean_k attention(h_t, mask_k)_i,    mask_k ~ Bernoulli(1/2)^{n x n}, 1 on the diagonal
 
-During learning, each batch has its own samples of coalitions, agent numbers and dropout. The published code also samples when it
-computes rewards. Here a reward is the mean over `REWARD_SAMPLES` samples, which are the same at each call.
+During learning, each batch has its own samples of coalitions, agent numbers and dropout. A reward is the mean over `REWARD_SAMPLES`
+samples, which are the same at each call.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -16,17 +17,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.credit.decoder_network import DecoderOutput
+from lare_rl.credit.decoder_network import DecoderOutput, split_key
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 
-__all__ = ["REWARD_SAMPLES", "STAS", "Coalitions", "TimeLayer", "dropout", "gelu"]
+__all__ = ["STAS", "Coalitions", "TimeLayer", "dropout", "gelu", "mean_over_samples"]
 
 SIZE, HEADS, LAYERS, COALITIONS = 128, 4, 3, 5
 """The width of a token, the number of heads, of layers over time, and of sampled coalitions."""
 REWARD_SAMPLES = 8
-"""The algorithm's reward is the mean over this number of samples of coalitions and agent numbers."""
 
 
 def dropout(x: Float[Array, "..."], key: PRNGKeyArray | None) -> Float[Array, "..."]:
@@ -39,8 +39,14 @@ def dropout(x: Float[Array, "..."], key: PRNGKeyArray | None) -> Float[Array, ".
 
 
 def gelu(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the exact GELU: x times the probability that a standard normal variable is below x (Hendrycks and Gimpel, 2016)."""
+    """Return the exact GELU (Hendrycks and Gimpel, 2016)."""
     return jax.nn.gelu(x, approximate=False)
+
+
+def mean_over_samples(function: Callable[[PRNGKeyArray], Float[Array, "*shape"]]) -> Float[Array, "*shape"]:
+    """Return the mean of a function of a random key over `REWARD_SAMPLES` keys, which are the same at each call."""
+    keys = jax.random.split(jax.random.key(jnp.uint32(0)), REWARD_SAMPLES)
+    return jnp.mean(jax.lax.map(function, keys), axis=0)
 
 
 def _split_heads(x: Float[Array, "*batch size"]) -> Float[Array, "*batch heads head_size"]:
@@ -66,7 +72,7 @@ class TimeLayer(eqx.Module):
     def __call__(
         self, x: Float[Array, "*batch steps size"], key: PRNGKeyArray | None
     ) -> Float[Array, "*batch steps size"]:
-        dropout_keys = (None,) * 3 if key is None else jax.random.split(key, 3)
+        dropout_keys = split_key(key, 3)
         query, keys, value = (_split_heads(layer(x)) for layer in (self.query, self.key, self.value))
         attention = attend(query, keys, value, causal_mask(x.shape[-2]), partial(dropout, key=dropout_keys[0]))
         a = dropout(self.merge(attention), dropout_keys[1])
@@ -75,7 +81,7 @@ class TimeLayer(eqx.Module):
 
 
 class Coalitions(eqx.Module):
-    """Attention over agents, averaged over random coalitions. Each agent has its own projection to queries."""
+    """Attention over agents with random numbers, averaged over random coalitions. Each agent has its own projection to queries."""
 
     query: Linear
     """The layers of all agents, stacked."""
@@ -89,13 +95,22 @@ class Coalitions(eqx.Module):
         self.key, self.value, self.merge = (Linear(size, size, key=key) for key in keys)
 
     def __call__(
-        self, x: Float[Array, "*batch agents size"], key: PRNGKeyArray, dropout_key: PRNGKeyArray | None
+        self,
+        x: Float[Array, "*batch agents size"],
+        numbers: Float[Array, "agents size"],
+        key: PRNGKeyArray,
+        dropout_key: PRNGKeyArray | None,
     ) -> Float[Array, "*batch agents size"]:
-        agents = x.shape[-2]
-        dropout_keys = (None,) * 2 if dropout_key is None else jax.random.split(dropout_key)
+        """Return the attention for one sample of coalitions, and of which agent has which of the embedded numbers."""
+        agents = len(numbers)
+        mask_key, order_key = jax.random.split(key)
+        x = x + numbers[jax.random.permutation(order_key, agents)]
+        dropout_keys = split_key(dropout_key, 2)
         query = _split_heads(jnp.einsum("...ad,ade->...ae", x, self.query.weight) + self.query.bias)
         # Returns are predicted where float64 is on. A probability in float32 has the same coins there.
-        mask = jax.random.bernoulli(key, jnp.float32(0.5), (COALITIONS, agents, agents)) | jnp.eye(agents, dtype=bool)
+        mask = jax.random.bernoulli(mask_key, jnp.float32(0.5), (COALITIONS, agents, agents)) | jnp.eye(
+            agents, dtype=bool
+        )
         attention = attend(
             jnp.tile(query, (COALITIONS, 1, 1)),  # each agent needs a query for each coalition
             _split_heads(self.key(x)),
@@ -114,7 +129,7 @@ class STAS(eqx.Module):
     """Embeds the observation and the one-hot action."""
     position: Float[Array, "steps size"]
     agent_number: Float[Array, "agents size"]
-    """Embeddings of agent numbers, which are assigned at random."""
+    """Embeddings of agent numbers."""
     layers: tuple[TimeLayer, ...]
     coalitions: Coalitions
     head: Linear
@@ -134,24 +149,19 @@ class STAS(eqx.Module):
         rows, agents = inputs.shape[:2]
         x = self.embed(inputs).reshape(-1, len(self.position), agents, SIZE)
         x = jnp.swapaxes(x, 1, 2) + self.position
-        sample_key, dropout_key, *keys = [None] * (2 + LAYERS) if key is None else jax.random.split(key, 2 + LAYERS)
+        sample_key, dropout_key, *keys = split_key(key, 2 + LAYERS)
         for layer, layer_key in zip(self.layers, keys, strict=True):
             x = layer(x, layer_key)
         x = jnp.swapaxes(x, 1, 2)
         if sample_key is not None:
             r_hat = self.agent_rewards(x, sample_key, dropout_key)
         else:
-            sample_keys = jax.random.split(jax.random.key(jnp.uint32(0)), REWARD_SAMPLES)
-            r_hat = jnp.mean(jax.lax.map(lambda key: self.agent_rewards(x, key, None), sample_keys), axis=0)
-        return DecoderOutput(r_hat.reshape(rows, agents), jnp.zeros((rows, agents)))
+            r_hat = mean_over_samples(lambda key: self.agent_rewards(x, key, None))
+        return DecoderOutput(r_hat.reshape(rows, agents))
 
     def agent_rewards(
         self, x: Float[Array, "episodes steps agents size"], key: PRNGKeyArray, dropout_key: PRNGKeyArray | None
     ) -> Float[Array, "episodes steps agents"]:
         """Return the agents' rewards for one sample of coalitions and of agent numbers."""
-        coalitions_key, order_key = jax.random.split(key)
-        order = jax.random.permutation(order_key, len(self.agent_number))
-        return (
-            self.output_scale
-            * self.head(self.coalitions(x + self.agent_number[order], coalitions_key, dropout_key))[..., 0]
-        )
+        x = self.coalitions(x, self.agent_number, key, dropout_key)
+        return self.output_scale * self.head(x)[..., 0]

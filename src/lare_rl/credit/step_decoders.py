@@ -24,7 +24,7 @@ class StepDecoder(eqx.Module):
         self.mlp = MLP(n_inputs or spec.n_inputs, spec.settings.hidden, 1, key=key)
 
     def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
-        return DecoderOutput(self.output_scale * self.mlp(inputs)[..., 0], jnp.zeros(inputs.shape[:-1]))
+        return DecoderOutput(self.output_scale * self.mlp(inputs)[..., 0])
 
 
 class Bottleneck(eqx.Module):

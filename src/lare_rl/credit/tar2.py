@@ -11,9 +11,8 @@ the return. The states and the past must tell which action an agent takes next:
 e is the embedding of an observation and its position. The rewards of an episode are not c, but shares of the return
 (`return_shares`).
 
-The network, the loss and the settings are those of the authors' code (github.com/AdityaKapoor74/MARL_Agent_Temporal_Credit_Assignment,
-`TARR_v2` at commit 2708495; the commit after it leaves out the outcome, as an ablation). The text of the paper could not be read, but
-for its abstract. docs/reference/differences.md lists the differences.
+The network, the loss and the settings are those of the authors' code, not of the paper; docs/reference/differences.md lists the
+differences.
 """
 
 import equinox as eqx
@@ -23,7 +22,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput
 from lare_rl.credit.spec import CreditSpec
-from lare_rl.credit.stas import REWARD_SAMPLES, Coalitions, TimeLayer, gelu
+from lare_rl.credit.stas import Coalitions, TimeLayer, gelu, mean_over_samples
 from lare_rl.nn.networks import MLP, Linear
 
 __all__ = ["TAR2", "pay_shares", "return_shares"]
@@ -41,7 +40,7 @@ class TAR2(eqx.Module):
     embed_action: Linear
     position: Float[Array, "steps size"]
     agent_numbers: Float[Array, "layers agents size"]
-    """Embeddings of agent numbers, which are assigned at random."""
+    """Embeddings of agent numbers."""
     time_layers: tuple[TimeLayer, ...]
     agent_layers: tuple[Coalitions, ...]
     contribution_model: MLP
@@ -69,10 +68,8 @@ class TAR2(eqx.Module):
         state = self.embed_observation(observation).reshape(*shape, SIZE) + self.position[:, None]
         tokens = state + self.embed_action(action).reshape(*shape, SIZE)
         if key is None:
-            sample_keys = jax.random.split(jax.random.key(jnp.uint32(0)), REWARD_SAMPLES)
-            samples = jax.lax.map(lambda key: self._contributions(self._attend(tokens, key)), sample_keys)
-            r_hat = self.output_scale * jnp.mean(samples, axis=0).reshape(inputs.shape[:2])
-            return DecoderOutput(r_hat, jnp.zeros_like(r_hat))
+            mean = mean_over_samples(lambda key: self._contributions(self._attend(tokens, key)))
+            return DecoderOutput(self.output_scale * mean.reshape(inputs.shape[:2]))
         h = self._attend(tokens, key)
         past = jnp.pad(h[:, :-1], ((0, 0), (1, 0), (0, 0), (0, 0)))
         mean_state = jnp.broadcast_to(jnp.mean(state, axis=2, keepdims=True), state.shape)
@@ -90,10 +87,8 @@ class TAR2(eqx.Module):
         outputs = []
         layers = self.time_layers, self.agent_layers, self.agent_numbers, jax.random.split(key, LAYERS)
         for time_layer, agent_layer, numbers, layer_key in zip(*layers, strict=True):
-            coalitions_key, order_key = jax.random.split(layer_key)
             x = jnp.swapaxes(time_layer(jnp.swapaxes(x, 1, 2), None), 1, 2)
-            order = jax.random.permutation(order_key, len(numbers))
-            x = agent_layer(x + numbers[order], coalitions_key, None)
+            x = agent_layer(x, numbers, layer_key, None)
             outputs.append(x)
         return jnp.concatenate(outputs, axis=-1)
 
@@ -108,7 +103,7 @@ def pay_shares(
     returns: Float[Array, "*batch"],
     max_steps: int,
 ) -> Float[Array, "*batch agents"]:
-    """Return each agent's share of the return of its episode. All episodes have `max_steps` steps, and are whole.
+    """Return what each agent is paid at each step: its share of the return. All episodes have `max_steps` steps, and are whole.
 
     The mean over the agents that are alive is the share of the step, and R is the sum of these means.
     """
@@ -119,16 +114,15 @@ def pay_shares(
 def return_shares(
     contributions: Float[Array, "episodes steps agents"], alive: Bool[Array, "episodes steps agents"]
 ) -> Float[Array, "episodes steps agents"]:
-    """Return the share of each agent at each step: the deterministic normalisation of TAR2 (Kapoor et al., 2025, arXiv 2502.04864).
+    """Return the share of each agent at each step, by the deterministic normalisation of contributions c_{i,t}.
 
-    A decoder gives contributions c_{i,t}. Those of a step, and those of the agents of a step, become weights that add up to 1:
+    Those of the steps, and those of the agents of a step, become weights that add up to 1:
 
         w_t     = (C_t - min C) / sum_u (C_u - min C),              C_t = sum_i c_{i,t}
         w_{i,t} = (c_{i,t} - min_j c_{j,t}) / sum_j (c_{j,t} - min_k c_{k,t})
 
     The share of agent i at step t is w_t w_{i,t}. The shares of an episode add up to 1 whatever the contributions are, so that the
-    rewards share * R add up to the return. Only agents that are alive have a share. If all contributions of a sum are equal, their
-    weights are equal, too: the authors' code pays nothing then, and adds 1e-5 to each denominator.
+    rewards share * R add up to the return. Only agents that are alive have a share. Equal contributions have equal weights.
     """
     step_contribution = jnp.sum(jnp.where(alive, contributions, 0), axis=-1)
     step_weight = _weights(step_contribution, jnp.any(alive, axis=-1))
