@@ -26,7 +26,7 @@ def n_usable_cores() -> int:
 
 
 def try_lock(file: IO[bytes]) -> bool:
-    """Lock a file until it is closed. Return False if it is locked already, and True if the file system has no locks."""
+    """Lock a file until it is closed. Return False if another process has locked it, and True if the file system has no locks."""
     try:
         if sys.platform == "win32":
             import msvcrt

@@ -11,7 +11,7 @@ __all__ = ["as_numbers", "as_rows"]
 
 
 def as_numbers(name: str, values: Any) -> Float[np.ndarray, "*shape"]:
-    """Return an argument as an array of float32. Raises `LareError`, which names it, if it is no array of numbers."""
+    """Return the argument `name` as an array of float32. Raises `LareError` if it is no array of numbers."""
     try:
         with np.errstate(over="ignore"):  # numbers above 3.4e38 become infinite
             array = np.asarray(values)
@@ -23,7 +23,7 @@ def as_numbers(name: str, values: Any) -> Float[np.ndarray, "*shape"]:
 
 
 def as_rows(name: str, values: Any, size: int) -> Float[np.ndarray, "*batch size"]:
-    """Return a row of `size` numbers, or a batch of rows, as `as_numbers` does. Raises `LareError` for other shapes too."""
+    """Return a row of `size` numbers, or a batch of rows, as float32. Raises `LareError` for anything else."""
     array = as_numbers(name, values)
     if array.ndim not in (1, 2) or array.shape[-1] != size:
         raise LareError(f"{name}s must have the shape (batch, {size}) or ({size},): the shape is {array.shape}")
