@@ -15,8 +15,7 @@ from lare_rl.runs.directory import Run, as_run
 from lare_rl.training.policy import HostPolicy, draw_noise, init_host_memory, make_host_policy
 from lare_rl.training.saved_state import load_actor
 from lare_rl.training.streams import Stream, numpy_generator
-from lare_rl.util.rows import as_rows
-from lare_rl.util.shapes import padded_size
+from lare_rl.util.rows import as_rows, padded_size
 
 __all__ = ["RunPolicy", "load_policy"]
 

@@ -61,13 +61,9 @@ def save_best(directory: Path, best: BestPolicy) -> None:
 
 
 def load_best(directory: Path, actor_shape: Any, n_seeds: int) -> BestPolicy:
-    """Read the best policies from a checkpoint's directory.
+    """Read the best policies from a checkpoint's directory. `actor_shape` is an actor, whose leaves may be shapes.
 
-    Args:
-        actor_shape: an actor, whose leaves may be shapes.
-
-    Raises:
-        LareError: there is no such file, or it has another structure.
+    Raises `LareError` if there is no such file, or it has another structure.
     """
     path = directory / BEST_FILE
     if not path.is_file():

@@ -22,8 +22,8 @@ from lare_rl.runs.metrics_file import MAX_INTEGER
 from lare_rl.util.files import make_directory, remove_partial_files, replace_npz
 from lare_rl.util.npz import DAMAGED_FILE_ERRORS, open_npz, report_damage
 from lare_rl.util.renamed_fields import rename_fields
+from lare_rl.util.rows import padded_size
 from lare_rl.util.safe_io import read_json, read_json_object
-from lare_rl.util.shapes import padded_size
 
 __all__ = ["STATE_FILE", "fill_template", "load", "named_leaves", "read_metadata", "take_snapshot", "write"]
 
@@ -124,16 +124,11 @@ def write(directory: Path, snapshot: Snapshot) -> None:
 
 
 def load(directory: Path, template: State) -> tuple[State, dict[str, Any], dict[str, np.ndarray]]:
-    """Read a checkpoint.
+    """Return a saved training state, and its `metadata` and `arrays`.
 
-    Args:
-        template: a training state of the same structure, whose leaves may be shapes.
+    The template is a training state of the same structure, whose leaves may be shapes.
 
-    Returns:
-        The training state, and `metadata` and `arrays` as saved.
-
-    Raises:
-        LareError: there is no checkpoint, or it has another structure.
+    Raises `LareError` if there is no checkpoint, or it has another structure.
     """
     path = directory / STATE_FILE
     if not path.is_file():

@@ -55,12 +55,7 @@ class Registry(Mapping[str, T], Generic[T]):
     """Values by name, which plugins can add to: `METHODS = Registry[Method]("method")`."""
 
     def __init__(self, kind: str, kinds: str | None = None):
-        """Create an empty registry.
-
-        Args:
-            kind: the noun for its values in messages, such as "method".
-            kinds: its plural, if that does not just add an s.
-        """
+        """Create an empty registry. `kind` is the noun for a value in messages, and `kinds` its plural, by default with an s."""
         self._kind, self._kinds = kind, kinds or f"{kind}s"
         self._values: dict[str, T] = {}
 

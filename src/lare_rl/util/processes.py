@@ -38,6 +38,6 @@ def try_lock(file: IO[bytes]) -> bool:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except (BlockingIOError, PermissionError):
         return False
-    except (ImportError, OSError):  # some network file systems have no locks
-        return True
+    except (ImportError, OSError):
+        pass  # some network file systems have no locks
     return True

@@ -59,13 +59,9 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
 
 
 def read_json(text: str | bytes, strict: bool = True) -> Any:
-    """Parse a JSON text.
+    """Parse a JSON text, whose strings may contain line breaks if not `strict`.
 
-    Args:
-        strict: if false, strings may contain line breaks.
-
-    Raises:
-        ValueError: the text is not JSON, or is nested too deep.
+    Raises `ValueError` if the text is not JSON, or is nested too deep.
     """
     try:
         return check_depth(json.loads(text, strict=strict, parse_int=parse_integer))

@@ -60,11 +60,9 @@ def standard_error(values: Float[np.ndarray, " values"]) -> float:
 
 
 def grouped_standard_error(group_means: Float[np.ndarray, " groups"], error_within: float) -> float:
-    """Return the standard error of the mean of groups, estimated between groups or within them, whichever is larger.
+    """Return the larger of two standard errors of the mean of grouped values: between the groups, and `error_within` them.
 
-    Args:
-        group_means: the mean of each group, such as each seed's mean over its episodes.
-        error_within: the standard error of the mean of all values, by their deviations from the means of their groups.
+    The groups are, for example, seeds, and the values the returns of their episodes.
     """
     return max(error_within, standard_error(group_means))
 

@@ -45,13 +45,16 @@ class StochasticPolicy(eqx.Module):
     def sample(self, observation: Observation, noise: Action, available: Available = None) -> Action:
         """Return the action for this noise: standard normal or, for choices, Gumbel."""
         if self.log_std is None:
-            logits = self.logits(observation, available)
-            return jax.nn.one_hot(jnp.argmax(logits + noise, axis=-1), logits.shape[-1])
+            return _choose(self.logits(observation, available) + noise)
         return self.network(observation) + jnp.exp(self.log_std) * noise
 
     def mode(self, observation: Observation, available: Available = None) -> Action:
         """Return the most likely action."""
         if self.log_std is None:
-            logits = self.logits(observation, available)
-            return jax.nn.one_hot(jnp.argmax(logits, axis=-1), logits.shape[-1])
+            return _choose(self.logits(observation, available))
         return self.network(observation)
+
+
+def _choose(logits: Action) -> Action:
+    """Return the choice of the largest logit."""
+    return jax.nn.one_hot(jnp.argmax(logits, axis=-1), logits.shape[-1])
