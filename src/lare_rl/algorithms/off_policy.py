@@ -27,7 +27,7 @@ class OffPolicySettings(AlgorithmSettings):
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
     """Discount factor."""
     tau: Annotated[float, Field(gt=0, le=1)] = 0.005
-    """Fraction by which target networks move towards the online networks at a time."""
+    """Fraction of the online networks in each Polyak update of the target networks."""
     warmup: Annotated[int, Field(ge=0)] = 10_000
     """Environment steps with uniformly random actions before the first update."""
 

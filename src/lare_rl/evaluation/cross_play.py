@@ -33,7 +33,7 @@ class Match(NamedTuple):
 def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
     """Let the first team of each run play against the second team of each: four matches, all from the same initial states.
 
-    Raises `LareError` if the runs differ in task or algorithm, the task has not two teams or is not in JAX, or `episodes` is less than 1.
+    Raises `LareError` if the runs differ in task or algorithm, or the task has other than two teams or is not in JAX.
     """
     episodes = check_count("episodes", episodes)
     task, other_task = (run.config.task for run in runs)

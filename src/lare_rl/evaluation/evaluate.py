@@ -154,7 +154,7 @@ def measure_random_returns(task: TaskSpec, n_episodes: int = RANDOM_EPISODES) ->
 
 
 def n_random_episodes(run_steps: int, longest_episode: int) -> int:
-    """Return how many episodes of random actions are cheap beside a run: 10 to 50, and above 10 at most a quarter of its steps."""
+    """Return how many episodes of random actions are cheap beside a run: as many as fill a quarter of its steps, but 10 to 50."""
     return min(max(run_steps // 4 // longest_episode, RANDOM_EPISODES), MAX_RANDOM_EPISODES)
 
 
@@ -167,8 +167,8 @@ def play_random(
 ) -> list[list[Episode]]:
     """Play `n_episodes` episodes of random actions in the environment of evaluations, and return them for each role of the task.
 
-    There are fewer if they take longer than `limit_s` seconds, but at least `MIN_RANDOM_EPISODES`; and none if the environment does not
-    run, or its module is not trusted.
+    There are fewer if they take longer than `limit_s` seconds (see `MIN_RANDOM_EPISODES`), and none if the environment does not run, or
+    its module is not trusted.
 
     Args:
         on_episode: called with the number of episodes after each.

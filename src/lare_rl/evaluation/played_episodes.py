@@ -80,7 +80,7 @@ def play_run(run: Run, n_episodes: int = 1, *, actor: Any = None, key: int = 0) 
 
     Args:
         run: the run, which must have a checkpoint.
-        actor: an actor of one seed that plays instead of the first seed's.
+        actor: an actor with an axis of one seed; by default, that of the run's first seed.
         key: the number of the random key, if the environment is in JAX.
     """
     state = load_learner(run)

@@ -24,16 +24,16 @@ from lare_rl.evaluation.policy import RunPolicy
 from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import make_jax_env
 from lare_rl.training.streams import Stream, episode_seed
-from lare_rl.util.files import check_new_path
+from lare_rl.util.files import check_new_path, write_bytes
 
 __all__ = ["check_video_path", "encode_film", "record_frames", "record_video", "write_video"]
 
 MANY_AGENTS_FPS = 8
-"""Frames in a second of a film of many agents."""
+"""Frames per second of a film of many agents."""
 MAX_GIF_FPS = 25.0
-"""The most frames in a second of a GIF, because drawing a frame may take long without a graphics card."""
+"""The most frames per second of a GIF, because drawing a frame may take long without a graphics card."""
 DEFAULT_FPS = 30
-"""Frames in a second of an environment that does not say how many it draws."""
+"""Frames per second of an environment that does not say how many it draws."""
 MAX_DRAWINGS = 200
 """The most frames of a film of a single agent in JAX, whose package may need a second for each."""
 FRAME_SIZE = {"width": 320, "height": 320}
@@ -64,10 +64,10 @@ def record_frames(
     max_frames: int | None = None,
     played: PlayedEpisodes | None = None,
 ) -> tuple[list[Frame], float]:
-    """Return the frames of the film of `record_video`, and the seconds for which each is shown.
+    """Return the frames that `record_video` shows, and the seconds for which it shows each.
 
     Args:
-        max_fps: the largest number of frames in a second.
+        max_fps: the largest number of frames per second.
         max_frames: the largest number of frames. A longer film ends early; that of a single agent in JAX leaves steps out.
         played: episodes of a run with many agents; the film shows the first. By default, the policy plays new episodes.
 
@@ -117,16 +117,15 @@ def check_video_path(path: Path) -> None:
 
 def write_video(path: Path, frames: Sequence[Frame], frame_seconds: float) -> None:
     """Write a film whose frames are shown for `frame_seconds` each. Raise `LareError` if that fails."""
+    if path.suffix == ".gif":
+        write_bytes(path, _encode(_to_images(frames), "GIF", frame_seconds))
+        return
     try:
-        if path.suffix == ".gif":
-            path.write_bytes(_encode(_to_images(frames), "GIF", frame_seconds))
-            return
         import imageio.v3 as imageio
 
         imageio.imwrite(path, list(frames), fps=1 / frame_seconds)
     except (OSError, ValueError, ImportError, TypeError) as error:
-        hint = ".gif needs lare-rl[report], .mp4 needs lare-rl[video]"
-        raise LareError(f"the video {path} cannot be written: {error}; {hint}") from error
+        raise LareError(f"the video {path} cannot be written: {error}; .mp4 needs lare-rl[video]") from error
 
 
 def _to_images(frames: Iterable[Frame]) -> list[Any]:

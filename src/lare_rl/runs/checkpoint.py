@@ -160,7 +160,7 @@ def named_leaves(state: Any) -> dict[str, Any]:
 def fill_template(template: State, arrays: Mapping[str, np.ndarray]) -> State:
     """Replace the leaves of a template by saved arrays, whose names may be of an earlier version.
 
-    Leaves that are NumPy arrays, and may have 64 bits, stay NumPy arrays.
+    A leaf that is a NumPy array, which may have 64 bits, stays a NumPy array.
 
     Raises `ValueError` if an array is missing, or if a shape or a type differs.
     """

@@ -74,7 +74,7 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
         "critic/value": "Mean target of the team's value, over these steps.",
     },
     "CreditAssigner only": {
-        "credit/episodes": "Number of payments that were learned from, or wait for it; of ended episodes, if each has one payment.",
+        "credit/episodes": "Number of payments that were learned from or still wait. If episodes are paid once: of ended episodes.",
         "credit/dropped": "Number of episodes that were dropped.",
         "credit/fits": "Number of gradient updates of the decoder; 0 for a closed form.",
     },

@@ -120,7 +120,6 @@ def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | N
             return "it was not started, because the sweep was stopped"
         assert process.stdin is not None
         assert process.stdout is not None
-        error = ""
         try:
             with contextlib.suppress(OSError, ValueError):  # the process has ended, or `stop` has closed its input
                 process.stdin.write(request + "\n")

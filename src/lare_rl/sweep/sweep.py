@@ -39,7 +39,7 @@ class Sweep(Resources):
     algorithms: tuple[str, ...] = ()
     """By default, the algorithm of each task."""
     draws: Draws = (0,)
-    """Draws of the recorded replies with the latent functions. Methods without a latent function are trained once."""
+    """Draws of the latent functions from the recorded replies. Methods without a latent function are trained once."""
     functions: dict[str, tuple[Path, ...]] = Field(default_factory=dict)
     """Files of latent functions by the name of their task, one for each team. By default, recorded replies are used."""
     settings: dict[str, Any] = Field(default_factory=dict)

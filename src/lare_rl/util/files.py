@@ -106,7 +106,7 @@ def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
 
 
 def remove_partial_files(path: Path) -> None:
-    """Remove what processes have left that were killed while they wrote `path`, whose name may have wildcards."""
+    """Remove what killed processes have left of writing `path`, whose name may have wildcards."""
     for partial_file in path.parent.glob(f"{path.name}.*.new"):
         partial_file.unlink(missing_ok=True)
 

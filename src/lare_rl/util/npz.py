@@ -18,7 +18,7 @@ DAMAGED_FILE_ERRORS = (
     *(OSError, ValueError, KeyError, EOFError, NotImplementedError, RecursionError, zipfile.BadZipFile, zlib.error),
     *(tokenize.TokenError, TypeError, IndexError, AttributeError, OverflowError, MemoryError, SyntaxError),
 )
-"""What reading a file may raise that is damaged, or holds something else."""
+"""Errors from reading a file that is damaged, or holds something else."""
 
 MAX_REASON = 200
 """Letters that are quoted of an error's message, because some messages repeat the file."""

@@ -9,7 +9,7 @@ __all__ = ["n_usable_cores", "own_session", "try_lock", "usable_cores"]
 
 
 def own_session() -> dict[str, Any]:
-    """Return the options of `subprocess.Popen` by which Ctrl-C in the terminal reaches only this process, not the new one."""
+    """Return options of `subprocess.Popen` that keep Ctrl-C in the terminal from the new process."""
     if sys.platform == "win32":
         return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
     return {"start_new_session": True}

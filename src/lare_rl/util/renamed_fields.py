@@ -90,7 +90,7 @@ _RENAMED_PATHS = {
 def rename_keys(values: Any) -> Any:
     """Return a table, with the tables in it, under the present names of keys.
 
-    If a table has both names of a key, both stay: reading it then reports the old one as unknown.
+    If a table has both names of a key, both stay, and the reader of the table refuses the old one as unknown.
     """
     if isinstance(values, list):
         return [rename_keys(value) for value in values]

@@ -126,7 +126,7 @@ def _return_std(return_rms: RunningMeanStd) -> Float[Array, " 1"]:
 def advantages(rollout: Rollout, value: PerStep, next_value: PerStep, settings: PPOSettings) -> PerStep:
     """Return generalised advantage estimates (Schulman et al., 2016, Eq. 16), computed backwards through time.
 
-    `value` is the value of the observation before each step, and `next_value` of the one after it.
+    `value` is V of the observation before each step, and `next_value` of that after it.
     """
     discount = settings.gamma * (1 - rollout.terminated)
     deltas = rollout.reward + discount * next_value - value
