@@ -132,7 +132,7 @@ def extend_run(run: Run, steps: int) -> Run:
             f"steps = {steps}: the run is planned for {settings.steps}, which can only be increased; to continue it as planned, "
             "leave the steps out"
         )
-    extended = ResolvedSettings(**dict(settings) | {"steps": steps})
+    extended = ResolvedSettings(**{**dict(settings), "steps": steps})
     config = run.config.model_copy(update={"settings": extended, "ended_at": (*run.config.ended_at, settings.steps)})
     write_config(run.directory, config)
     return replace(run, config=config)
