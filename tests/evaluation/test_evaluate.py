@@ -82,8 +82,9 @@ def test_write_video(tmp_path, monkeypatch):
     frames = [np.full((16, 16, 3), 20 * i, np.uint8) for i in range(5)]
     write_video(tmp_path / "film.gif", frames, 0.05)
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF8")
-    with pytest.raises(LareError, match="cannot be written"):
+    with pytest.raises(LareError, match="cannot be written") as error:
         write_video(tmp_path / "none" / "film.gif", frames, 0.05)
+    assert "needs lare-rl" not in str(error.value)
     for name, words in (("film.xyz", r"\.gif, or in \.mp4"), ("none/film.gif", "no directory")):
         with pytest.raises(LareError, match=words):
             check_video_path(tmp_path / name)

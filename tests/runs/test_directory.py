@@ -65,6 +65,12 @@ def test_metrics_are_parsed_once_per_file_state(run, monkeypatch):
     assert read_metrics(run.directory) == [line | {DETERMINISTIC_RETURN: 2.0}]
 
 
+def test_metrics_that_cannot_be_truncated(tmp_path):
+    (tmp_path / "metrics.jsonl").mkdir()
+    with pytest.raises(LareError, match="cannot be written"):
+        truncate_metrics(tmp_path, 0)
+
+
 def test_metrics_have_a_meaning_and_the_lock_refuses_a_second_process(run):
     metric, files = r'"((?:evaluation|credit|critic|actor|time)/\w+)"', Path(lare_rl.__file__).parent.rglob("*.py")
     names = {name for path in files for name in re.findall(metric, path.read_text(encoding="utf-8"))}

@@ -43,7 +43,8 @@ def test_cache_variables(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "environment", [{"LARE_CACHE": "off"}, {"JAX_COMPILATION_CACHE_DIR": "other"}, {"LARE_CACHE": __file__}]
+    "environment",
+    [{"LARE_CACHE": "off"}, {"LARE_CACHE": " off "}, {"JAX_COMPILATION_CACHE_DIR": "other"}, {"LARE_CACHE": __file__}],
 )
 def test_no_cache(environment):
     assert cache_variables(environment) == {}

@@ -27,7 +27,8 @@ def plugin(tmp_path, monkeypatch, numbers):
     load_plugins.cache_clear()
     yield tmp_path / "my_plugin.py"
     load_plugins.cache_clear()
-    sys.modules.pop("my_plugin", None)
+    for name in ("my_plugin", "my_second_plugin"):
+        sys.modules.pop(name, None)
 
 
 def test_registry(numbers):
@@ -56,12 +57,20 @@ def test_plugin_of_the_environment_variable(plugin, numbers, monkeypatch):
     assert list(numbers) == ["one", "two"]
 
 
-def install(folder, value="my_plugin"):
+def install(folder, value="my_plugin", package="my-package"):
     """Install a package with an entry point of this value."""
-    info = folder / "my_package-1.0.dist-info"
+    info = folder / f"{package.replace('-', '_')}-1.0.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n")
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(f"[lare_rl.plugins]\nmine = {value}\n")
+
+
+def test_plugins_of_two_packages_with_one_name(plugin, numbers):
+    plugin.write_text(PLUGIN)
+    plugin.with_name("my_second_plugin.py").write_text(PLUGIN.replace("two", "three"))
+    install(plugin.parent)
+    install(plugin.parent, "my_second_plugin", "second-package")
+    assert set(numbers) == {"one", "two", "three"}
 
 
 def test_plugin_of_an_installed_package(plugin, numbers):

@@ -1,5 +1,7 @@
 """Reading of untrusted files."""
 
+from pathlib import Path
+
 import pytest
 
 from lare_rl.errors import LareError
@@ -71,3 +73,8 @@ def test_unreadable_text(tmp_path, content, words):
         path.write_bytes(content)
     with pytest.raises(LareError, match=words):
         read_text(path, 1 << 20)
+
+
+def test_path_with_a_null_character():
+    with pytest.raises(LareError, match="null"):
+        read_text(Path("a\0b"))

@@ -7,20 +7,20 @@ from typing import NamedTuple
 
 from jaxtyping import Array, Bool, Float
 
-__all__ = ["Action", "Available", "Metrics", "Observation", "Rollout", "Sequences", "Transitions", "Value"]
+__all__ = ["Action", "Available", "Metrics", "Observation", "PerStep", "Rollout", "Sequences", "Transitions"]
 
 Observation = Float[Array, "*batch observation"]
 Action = Float[Array, "*batch action"]
-"""In [-1, 1], or a one-hot row."""
+"""In [-1, 1], or a one-hot row. Means, logits and noise of an action have the same shape."""
 Available = Bool[Array, "*batch action"] | None
-"""Which choices are available. None: all of them, or the actions are continuous."""
-Value = Float[Array, "*batch"]
-"""Q(s, a) or V(s)."""
+"""Which choices are available. None: all of them, or actions are continuous."""
+PerStep = Float[Array, "*batch"]
+"""A number of each step, such as Q(s, a), V(s) or log pi(a | s)."""
 Metrics = dict[str, Float[Array, "*seeds"]]
 
 
 class Transitions(NamedTuple):
-    """A batch of single steps from the replay: `Consumes.TRANSITIONS`. Actions lie in [-1, 1]."""
+    """Single steps from the replay: `Consumes.TRANSITIONS`. Actions are continuous."""
 
     observation: Float[Array, "batch observation"]
     action: Float[Array, "batch action"]

@@ -14,7 +14,7 @@ __all__ = ["OffPolicySettings", "run_defaults"]
 
 
 class OffPolicySettings(AlgorithmSettings):
-    """The hyperparameters that these algorithms share; none of them depends on the task."""
+    """The hyperparameters that these algorithms share. None depends on the task."""
 
     hidden: tuple[Count, ...] = (256, 256)
     """Widths of the hidden layers of actor and critics."""
@@ -27,7 +27,7 @@ class OffPolicySettings(AlgorithmSettings):
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
     """Discount factor."""
     tau: Annotated[float, Field(gt=0, le=1)] = 0.005
-    """Fraction by which target networks move towards online ones at a time."""
+    """Fraction of the online networks in each Polyak update of the target networks."""
     warmup: Annotated[int, Field(ge=0)] = 10_000
     """Environment steps with uniformly random actions before the first update."""
 

@@ -3,9 +3,9 @@
 An algorithm is one package or one file: its settings, its update, and a call of `register_algorithm`. `Algorithm.module` names the
 module of its functions, which is imported when the algorithm is first used. The training loop calls these functions:
 
-    TRANSITIONS    init, get_actor, act, explore, update     as in `td3/td3.py`; the settings derive from `OffPolicySettings`
-    ROLLOUTS       init, get_actor, act, explore, update     as in `ppo/ppo.py`
-    SEQUENCES      init, get_actor, act, init_memory, epsilon, update     as in `qmix/qmix.py`; the settings derive from `SequenceSettings`
+    TRANSITIONS    init, get_actor, act, explore, update                  as in `td3/td3.py`
+    ROLLOUTS       init, get_actor, act, explore, update                  as in `ppo/ppo.py`
+    SEQUENCES      init, get_actor, act, init_memory, epsilon, update     as in `qmix/qmix.py`
 
 `lare-rl export` also writes the result of `logits(actor, observation, available)`, if the module has this function.
 """
@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib import import_module
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from lare_rl.errors import CheckedModel, Count, LareError
@@ -39,7 +38,7 @@ class AlgorithmSettings(CheckedModel):
 
 
 class SequenceSettings(AlgorithmSettings):
-    """The base class for algorithms that consume whole episodes: how many an update reads, and how often there is one."""
+    """The base class of the hyperparameters of an algorithm that consumes whole episodes."""
 
     batch_size: Count = 128
     """Episodes in one update."""
@@ -61,13 +60,13 @@ class Consumes(StrEnum):
 
 
 class Noise(StrEnum):
-    """The distribution of the exploration noise: independent numbers, one for each entry of an action."""
+    """The distribution of the exploration noise. Each entry of an action has an independent number."""
 
     NORMAL = "normal"
     GUMBEL = "gumbel"
     """The choice with the largest logit plus noise is a sample from the softmax."""
     UNIFORM = "uniform"
-    """In [0, 1), with one more number for each agent: whether it explores."""
+    """In [0, 1). A further number for each agent decides whether it explores."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +83,8 @@ class Algorithm:
     module: str
     """The module with the functions that the training loop calls (see above)."""
     run_defaults: "Callable[[EnvSpec, int | None], dict[str, Any]]"
-    """From an environment and the requested number of copies (None if none was requested) to the defaults of `Settings`, by name. In
-    place of `evaluate_every`, `evaluate_iterations` may count iterations. `credit` holds only the settings that differ."""
+    """Maps an environment, and the number of its copies if the user chose one, to the defaults of `Settings` by name.
+    `evaluate_iterations` may stand for `evaluate_every`, and counts iterations. `credit` holds only the settings that differ."""
     summary: str
     source: str
     continuous: bool = True
@@ -120,28 +119,23 @@ class Algorithm:
 
 ALGORITHMS = Registry[Algorithm]("algorithm")
 
-_SETTINGS = {
-    Consumes.TRANSITIONS: "lare_rl.algorithms.off_policy:OffPolicySettings",
-    Consumes.ROLLOUTS: "lare_rl.algorithms.registry:AlgorithmSettings",
-    Consumes.SEQUENCES: "lare_rl.algorithms.registry:SequenceSettings",
-}
-"""The classes that the settings of algorithms derive from. Their modules import this one."""
-
 
 def register_algorithm(algorithm: Algorithm) -> None:
     """Add an algorithm. Its name then works in `Settings(algorithm=...)` and on the command line.
 
-    Raises:
-        LareError: another algorithm has this name, or its settings or `consumes` are of the wrong class.
+    Raises `LareError` if another algorithm has this name, or if its settings or `consumes` are of the wrong class.
     """
+    from lare_rl.algorithms.off_policy import OffPolicySettings  # here, because that module imports this one
+
     if not isinstance(algorithm.consumes, Consumes):
         raise LareError(
             f"algorithm {algorithm.name}: consumes is {algorithm.consumes!r}: pass a member of lare_rl.algorithms.registry.Consumes"
         )
-    base = _SETTINGS[algorithm.consumes]
-    if not isinstance(algorithm.settings, resolve_name(base)):
+    bases = {Consumes.TRANSITIONS: OffPolicySettings, Consumes.SEQUENCES: SequenceSettings}
+    base = bases.get(algorithm.consumes, AlgorithmSettings)
+    if not isinstance(algorithm.settings, base):
         raise LareError(
-            f"algorithm {algorithm.name}: the settings of an algorithm that consumes {algorithm.consumes} derive from {base}: pass "
-            "an instance of such a class"
+            f"algorithm {algorithm.name}: the settings of an algorithm that consumes {algorithm.consumes} derive from "
+            f"{base.__module__}:{base.__name__}: pass an instance of such a class"
         )
     ALGORITHMS.register(algorithm.name, algorithm)

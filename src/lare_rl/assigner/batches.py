@@ -14,7 +14,7 @@ from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.descent import plan_batch
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.data.layouts import Layout, lay_out_packed, lay_out_padded, lay_out_sampled
-from lare_rl.util.shapes import pad_rows, padded_size
+from lare_rl.util.rows import pad_rows, padded_size
 
 __all__ = ["pack_in_order", "sample_batch", "whole_episodes"]
 

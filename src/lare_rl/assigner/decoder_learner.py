@@ -27,7 +27,7 @@ from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.methods import Fit
 from lare_rl.util.float64 import float64
-from lare_rl.util.shapes import pad_rows, padded_size
+from lare_rl.util.rows import pad_rows, padded_size
 
 __all__ = ["CHUNK_UPDATES", "DecoderLearner"]
 

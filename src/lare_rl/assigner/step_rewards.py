@@ -18,7 +18,7 @@ from lare_rl.credit import decoder_state
 from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.methods import Reward
 from lare_rl.credit.rewards import StepBatch
-from lare_rl.util.shapes import pad_rows, padded_size
+from lare_rl.util.rows import pad_rows, padded_size
 
 __all__ = ["StepRewards"]
 

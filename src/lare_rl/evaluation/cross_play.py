@@ -27,13 +27,13 @@ class Match(NamedTuple):
     first: Run
     second: Run
     returns: Float[np.ndarray, "first_seeds second_seeds"]
-    """The first team's mean return, for each pair of seeds."""
+    """The first team's mean return over the episodes, for each pair of seeds."""
 
 
 def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
     """Let the first team of each run play against the second team of each: four matches, all from the same initial states.
 
-    Raises `LareError` if the runs are not of one task with two teams, or of different algorithms, or `episodes` is less than 1.
+    Raises `LareError` if the runs differ in task or algorithm, or the task has other than two teams or is not in JAX.
     """
     episodes = check_count("episodes", episodes)
     task, other_task = (run.config.task for run in runs)
@@ -58,7 +58,7 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
 
 
 def _load_actors(run: Run) -> tuple[TrainConfig, list[Any]]:
-    """Load the actor of each seed, with an axis of one seed."""
+    """Load the configuration, and the actor of each seed with an axis of one seed."""
     state = load_learner(run)
     actors = get_actor(state.learner.algorithm, run.config.settings.steps, state.config)
     return state.config, [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], actors) for i in range(len(run.seeds))]

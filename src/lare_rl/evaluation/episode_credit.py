@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.closed_form import ClosedForm, reward_std
 from lare_rl.credit.decoder_settings import RECENT_STEPS
-from lare_rl.credit.decoder_state import score_type_index
+from lare_rl.credit.decoder_state import DecoderState, score_type_index
 from lare_rl.credit.methods import Fit
 from lare_rl.data import replay
 from lare_rl.data.replay import Index, StoredSteps
@@ -29,32 +29,32 @@ __all__ = ["EpisodeCredit", "FactorLabel", "label_factors", "load_episode_credit
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeCredit:
-    """The last finished episode of a run's first seed, and the factors' correlations."""
+    """The last finished episode of a run's first seed and its first environment, and correlations of the factors."""
 
     reward: Float[np.ndarray, "steps agents"]
     """True rewards."""
     training_reward: Float[np.ndarray, "steps agents"]
     """By the decoders of the last checkpoint."""
     uncertainty: Float[np.ndarray, " steps"] | None
-    """Two posterior standard deviations of the proxy reward, for a single agent and a closed-form decoder."""
+    """Two posterior standard deviations of the proxy reward. None for many agents, and without a posterior."""
     factors: Float[np.ndarray, "steps rows factors"]
     has_step_rewards: bool
-    """Whether the true rewards of single steps are known. They are unknown if only the last step has a reward."""
+    """Whether the true rewards of single steps are known: they are not if only the last step has a reward."""
     correlations: Float[np.ndarray, " factors"]
     """Pearson's correlation of each factor with the true reward, over the newest steps of all seeds. NaN if one never varies."""
 
 
 class FactorLabel(NamedTuple):
-    """A column of z, described by the source of phi."""
+    """A factor, described by the source of phi."""
 
     name: str
     meaning: str
     reads: str
-    """The entries that it reads."""
+    """The entries of observation and action that it reads."""
 
 
 def label_factors(run: Run, team_index: int = 0) -> list[FactorLabel]:
-    """Return a label of each column of z, for the function of one of the task's roles."""
+    """Return the labels of the factors of a team."""
     if not run.functions:
         return []
     function = run.functions[team_index]
@@ -64,7 +64,7 @@ def label_factors(run: Run, team_index: int = 0) -> list[FactorLabel]:
 
 
 def load_episode_credit(run: Run) -> EpisodeCredit | None:
-    """Return the credit of a run. None for a method without proxy rewards, and while no episode has finished."""
+    """Return the credit of a run. None for a method without proxy rewards, and while the first environment has finished no episode."""
     state = load_learner(run)
     config, learner = state.config, select_seed(state.learner)
     index = _find_newest_episode(learner)
@@ -77,27 +77,29 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
         return steps, rewards(steps, learner.decoders, config)
 
     steps, training_reward = read_rewards(learner, index)
+    reward = np.asarray(steps.columns["reward"])
+    return EpisodeCredit(
+        reward=reward,
+        training_reward=np.asarray(training_reward),
+        uncertainty=_uncertainty(steps, learner.decoders[0], config),
+        factors=np.asarray(steps.columns.get("factors", np.zeros((len(reward), 1, 0)))),
+        has_step_rewards=bool(reward[:-1].any()),
+        correlations=_factor_correlations(state.learner, config),
+    )
 
-    decoder, score_types = learner.decoders[0], config.credit_specs[0].score_types
+
+def _uncertainty(steps: StoredSteps, decoder: DecoderState, config: TrainConfig) -> Float[np.ndarray, " steps"] | None:
+    if decoder.closed_decoder is None or config.method.fit is Fit.SIGNS or config.n_proxy_rewards > 1:
+        return None
+    score_types = config.credit_specs[0].score_types
 
     def posterior_std(closed: ClosedForm, steps: StoredSteps) -> Float[Array, " steps"]:
         index = score_type_index(decoder, len(score_types))
         return reward_std(closed, decoder_inputs(steps, config, 0)[:, 0], score_types, index)
 
-    uncertainty = None
-    if decoder.closed_decoder is not None and config.method.fit is not Fit.SIGNS and config.n_proxy_rewards == 1:
-        with float64():
-            std = np.asarray(jax.jit(posterior_std)(decoder.closed_decoder, steps))
-        uncertainty = 2 * std / np.where(decoder.is_average, steps.length, 1)
-    reward = np.asarray(steps.columns["reward"])
-    return EpisodeCredit(
-        reward=reward,
-        training_reward=np.asarray(training_reward),
-        uncertainty=uncertainty,
-        factors=np.asarray(steps.columns.get("factors", np.zeros((len(reward), 1, 0)))),
-        has_step_rewards=bool(reward[:-1].any()),
-        correlations=_factor_correlations(state.learner, config),
-    )
+    with float64():
+        std = np.asarray(jax.jit(posterior_std)(decoder.closed_decoder, steps))
+    return 2 * std / np.where(decoder.is_average, steps.length, 1)
 
 
 def _find_newest_episode(learner: Learner) -> Index | None:
@@ -114,7 +116,7 @@ def _find_newest_episode(learner: Learner) -> Index | None:
 def _factor_correlations(learners: Learner, config: TrainConfig) -> Float[np.ndarray, " factors"]:
     """Compute the correlations of a single agent's factors with its true reward, over the newest steps of all seeds.
 
-    They are NaN if only returns are known. The array is empty for many agents.
+    They are NaN if only returns are known. The array is empty for many agents, and for a method without phi.
     """
     if not config.method.needs_phi or config.n_proxy_rewards > 1 or config.env.n_agents > 1:
         return np.zeros(0)
@@ -124,6 +126,6 @@ def _factor_correlations(learners: Learner, config: TrainConfig) -> Float[np.nda
     steps = jax.jit(jax.vmap(lambda buffer: replay.read(buffer, replay.newest_steps(buffer, n_steps))))(buffers)
     reward, last = np.asarray(steps.columns["reward"]).ravel(), np.asarray(steps.last).ravel()
     factors = np.asarray(steps.columns["factors"]).reshape(len(reward), -1)
-    if not reward[~last].any():  # only the last steps have rewards, so the true reward of each step is unknown
+    if not reward[~last].any():
         return np.full(factors.shape[1], np.nan)
     return column_correlations(factors, reward)

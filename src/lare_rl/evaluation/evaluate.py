@@ -46,9 +46,11 @@ RANDOM_EPISODES = 10
 MAX_RANDOM_EPISODES = 50
 """The largest number of episodes with random actions that a report plays."""
 MIN_RANDOM_EPISODES = 5
-"""Fewer episodes with random actions are played only if these take longer than `MAX_RANDOM_PLAY_S`."""
-RANDOM_PLAY_LIMIT_S, MAX_RANDOM_PLAY_S = 5.0, 120.0
-"""Seconds after which no other episode of random actions begins: once there are `MIN_RANDOM_EPISODES`, and in any case."""
+"""Fewer episodes have no useful standard deviation. They are only played if these take longer than `MAX_RANDOM_PLAY_S`."""
+RANDOM_PLAY_LIMIT_S = 5.0
+"""Time after which no episode of random actions begins if there are `MIN_RANDOM_EPISODES`."""
+MAX_RANDOM_PLAY_S = 120.0
+"""Time after which no episode of random actions begins in any case."""
 
 
 def evaluate_run(
@@ -62,12 +64,12 @@ def evaluate_run(
 
     The episodes begin in initial states that no evaluation of the run has used. Policies act as in training's evaluations: the
     choices of PPO and all actions of IPPO are sampled, other actions are deterministic. A team's return is the sum over the steps
-    of the mean over its agents.
+    of the mean reward of its agents.
 
     Args:
         episodes: the number of episodes of each seed.
         best: play the policy of each seed's best evaluation, instead of the last policy.
-        deterministic: always take the most likely action, where evaluations sample it.
+        deterministic: take the most likely action, where evaluations sample actions.
         environment: play in this environment, of the same module and with the same sizes. The default is that of the run's evaluations.
 
     Raises:
@@ -79,7 +81,7 @@ def evaluate_run(
 
 
 def move_evaluations(run: Run, environment: str | None) -> Run:
-    """Return the run with its evaluations in another environment. Raise `LareError` if that cannot be; None changes nothing."""
+    """Return the run with its evaluations in another environment, if one is named. Raise `LareError` if the run is not on the host."""
     if environment is None:
         return run
     task = run.config.task
@@ -99,7 +101,7 @@ def evaluate_policy(
 ) -> Evaluation:
     """Return all measurements of the episodes of `evaluate_run`, which has the same arguments and errors.
 
-    On the host, `on_episode` is called with the number of episodes of each seed, when some have ended.
+    On the host, `on_episode` is called with the number of episodes of each seed that have ended.
     """
     episodes = check_count("episodes", episodes)
     task = run.config.task
@@ -115,8 +117,9 @@ def evaluate_policy(
 
 
 def evaluation_seeds(run: Run, episodes: int) -> list[int]:
-    """Return the seeds with which an environment on the host is reset for the episodes of `evaluate_policy`, of all seeds of the run."""
-    numbers = range(run.config.settings.evaluation_episodes, run.config.settings.evaluation_episodes + episodes)
+    """Return the seeds with which `evaluate_policy` resets an environment on the host, of all episodes of all seeds of the run."""
+    first = run.config.settings.evaluation_episodes
+    numbers = range(first, first + episodes)
     return [episode_seed(seed, Stream.EVALUATION_EPISODES, number) for number in numbers for seed in run.seeds]
 
 
@@ -127,7 +130,7 @@ def gain_over_random(
 
         error^2 = var(random) / n + max(var over the seeds / seeds, mean var over the episodes / (seeds episodes))
 
-    Returns None for a single episode, which has no error.
+    Returns None if there is a single episode, which has no error.
     """
     estimate = mean_with_error(returns)
     if estimate is None or len(random_returns) < 2:
@@ -137,7 +140,7 @@ def gain_over_random(
 
 
 def mean_with_error(values: Float[np.ndarray, "seeds episodes"]) -> tuple[float, float] | None:
-    """Return the mean and its standard error, from seed to seed or from episode to episode. Return None for a single episode."""
+    """Return the mean and its standard error, between seeds or episodes, whichever is larger. Return None for a single episode."""
     if values.shape[1] < 2:
         return None
     error = episode_error(values.var(axis=1, ddof=1), values.shape[1])
@@ -145,13 +148,13 @@ def mean_with_error(values: Float[np.ndarray, "seeds episodes"]) -> tuple[float,
 
 
 def measure_random_returns(task: TaskSpec, n_episodes: int = RANDOM_EPISODES) -> Float[np.ndarray, "teams episodes"]:
-    """Return the returns of `play_random`, whose limit of time rises with the number of episodes."""
+    """Return the returns of `play_random`, with a time limit in proportion to the number of episodes."""
     limit_s = RANDOM_PLAY_LIMIT_S * n_episodes / RANDOM_EPISODES
     return np.array([[episode.return_ for episode in episodes] for episodes in play_random(task, n_episodes, limit_s)])
 
 
 def n_random_episodes(run_steps: int, longest_episode: int) -> int:
-    """Return how many episodes of random actions are cheap beside a run: together at most a quarter of its steps, from 10 to 50."""
+    """Return how many episodes of random actions are cheap beside a run: as many as fill a quarter of its steps, but 10 to 50."""
     return min(max(run_steps // 4 // longest_episode, RANDOM_EPISODES), MAX_RANDOM_EPISODES)
 
 
@@ -159,23 +162,22 @@ def play_random(
     task: TaskSpec,
     n_episodes: int = RANDOM_EPISODES,
     limit_s: float = RANDOM_PLAY_LIMIT_S,
-    on_episode: EpisodeListener | None = None,
+    on_episode: EpisodeListener = lambda n_done: None,
     seeds: Sequence[int] = (),
 ) -> list[list[Episode]]:
-    """Play `n_episodes` episodes of random actions in the environment of evaluations, or fewer if they take long.
+    """Play `n_episodes` episodes of random actions in the environment of evaluations, and return them for each role of the task.
 
-    Returns the same episodes from the view of each role of the task. The environment is reset with `seeds` by turns, by default with
-    the numbers of the episodes.
+    There are fewer if they take longer than `limit_s` seconds (see `MIN_RANDOM_EPISODES`), and none if the environment does not run, or
+    its module is not trusted.
 
-    After `limit_s` seconds there are `MIN_RANDOM_EPISODES`, because fewer have no useful deviation, and after `MAX_RANDOM_PLAY_S`
-    none begins.
-
-    The lists are empty if the environment does not run, or if its module must not be imported for a report.
+    Args:
+        on_episode: called with the number of episodes after each.
+        seeds: the environment is reset with these by turns; by default, with the numbers of the episodes.
     """
-    task, episodes = task.evaluation_task, list[list[Episode]]()
-    start = time.monotonic()
+    task = task.evaluation_task
     if untrusted_module(task) is not None:
         return [[] for _ in task.roles]
+    start, episodes = time.monotonic(), list[list[Episode]]()
     with suppress(LareError), closing(make_host_env(task)) as env:
         while len(episodes) < n_episodes:
             seconds = time.monotonic() - start
@@ -184,6 +186,5 @@ def play_random(
             number = len(episodes)
             seed = seeds[number % len(seeds)] if seeds else number
             episodes.append(play_roles(env, task.roles, None, np.random.default_rng(number), seed))
-            if on_episode is not None:
-                on_episode(len(episodes))
-    return [[views[role_index] for views in episodes] for role_index in range(len(task.roles))]
+            on_episode(len(episodes))
+    return [[by_role[role_index] for by_role in episodes] for role_index in range(len(task.roles))]

@@ -57,7 +57,7 @@ class PlayedEpisodes:
     training_reward: Float[np.ndarray, "time episodes agents"] | None
     """By the decoders of the last checkpoint. None for a method without proxy rewards."""
     state: Any
-    """The states after each step, if the environment is made of pure functions."""
+    """The states after each step, if the environment is in JAX."""
 
     @property
     def reward(self) -> Float[np.ndarray, "time episodes agents"]:
@@ -70,7 +70,7 @@ class PlayedEpisodes:
         return self.reward if self.training_reward is None else self.training_reward
 
     def select_episode(self, values: Any, episode: int = 0) -> Any:
-        """Return the values of one episode, [time ...], until its end. `values` are arrays [time episodes ...]."""
+        """Return the values of an episode until its end, [time ...], from arrays [time episodes ...]."""
         length = int(self.mask[:, episode].sum())
         return jax.tree.map(lambda leaf: leaf[:length, episode], values)
 
@@ -80,8 +80,8 @@ def play_run(run: Run, n_episodes: int = 1, *, actor: Any = None, key: int = 0) 
 
     Args:
         run: the run, which must have a checkpoint.
-        actor: an actor of one seed that plays instead of the first seed's.
-        key: the random key of an environment of pure functions.
+        actor: an actor with an axis of one seed; by default, that of the run's first seed.
+        key: the number of the random key, if the environment is in JAX.
     """
     state = load_learner(run)
     config, learner = state.config, state.learner
@@ -112,7 +112,7 @@ def unroll_policy(env: JaxEnv, config: TrainConfig, actor: Any, n_episodes: int,
 
 
 def _unroll_on_host(run: Run, config: TrainConfig, actor: Any, n_episodes: int) -> EpisodeBatch:
-    """Play as many episodes at a time as environments may be open. An episode does not depend on how many these are."""
+    """Play as many episodes at a time as environments may be open. Their number does not affect an episode."""
     seeds, task, batches = run.seeds[:1], run.config.task, []
     with make_vec_env(task, n_open_envs(task, 1, n_episodes)) as envs:
         for numbers, policy in policy_turns(envs, replace(config, deterministic=False), actor, seeds, n_episodes):
@@ -123,7 +123,7 @@ def _unroll_on_host(run: Run, config: TrainConfig, actor: Any, n_episodes: int) 
 
 
 def _join_episodes(batches: Sequence[EpisodeBatch]) -> EpisodeBatch:
-    """Join episodes along their axis. The last step of a shorter batch is repeated, as for an episode that has ended."""
+    """Join batches along the axis of episodes. The last step of a shorter batch is repeated, as that of an ended episode is."""
     n_steps = max(len(batch.mask) for batch in batches)
 
     def lengthen(batch: EpisodeBatch) -> EpisodeBatch:
@@ -160,10 +160,10 @@ def compute_training_rewards(
 
 @dataclass(frozen=True, kw_only=True)
 class TeamSample:
-    """Steps of one team, over some episodes of the first seed's policy. A row is a step of an agent or, for a state, of the team."""
+    """Steps of one team in some episodes. A row is a step of an agent or, if phi reads the state, of the team."""
 
     next_observation: Float[np.ndarray, "rows observation"]
-    """Each agent's observation after the step, or the state."""
+    """The observation, or the state, after the step."""
     factors: Float[np.ndarray, "rows factors"]
     reward: Float[np.ndarray, " rows"]
     """The true reward."""
@@ -175,7 +175,7 @@ class TeamSample:
 
 
 def sample_steps(run: Run, actor: Any = None) -> list[TeamSample]:
-    """Sample steps of each team, under the first seed's policy or another actor of one seed (see `play_run`)."""
+    """Return steps of each team, from `N_SAMPLE_EPISODES` episodes of `play_run`."""
     played = play_run(run, N_SAMPLE_EPISODES, actor=actor, key=1)
     config, samples = played.config, []
     steps = jax.tree.map(lambda leaf: np.asarray(leaf)[played.mask], played.steps)  # [steps ...]

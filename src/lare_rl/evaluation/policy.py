@@ -15,8 +15,7 @@ from lare_rl.runs.directory import Run, as_run
 from lare_rl.training.policy import HostPolicy, draw_noise, init_host_memory, make_host_policy
 from lare_rl.training.saved_state import load_actor
 from lare_rl.training.streams import Stream, numpy_generator
-from lare_rl.util.rows import as_rows
-from lare_rl.util.shapes import padded_size
+from lare_rl.util.rows import as_rows, padded_size
 
 __all__ = ["RunPolicy", "load_policy"]
 
@@ -24,10 +23,10 @@ __all__ = ["RunPolicy", "load_policy"]
 class RunPolicy:
     """The policy of a seed: a function from an observation to an action, or from a batch to a batch.
 
-    An action is what the environment's package takes in its own `step`: a discrete action is its number, or an array of numbers if
-    there are several choices at a time. The policy acts as in evaluations: PPO's choices are sampled, and all other actions are
-    deterministic. Observations that are not one row of numbers must be flattened first (`gymnasium.spaces.flatten`). Environments
-    in which actions may be unavailable (Jumanji's) also need the mask, `policy(observation, available)`.
+    An action is what the environment's own `step` takes: a discrete action is its number, or an array of numbers if there are several
+    choices at a time. The policy acts as in evaluations: PPO's choices are sampled, and all other actions are deterministic.
+    Observations that are not one row of numbers must be flattened first (`gymnasium.spaces.flatten`). Environments in which actions
+    may be unavailable (Jumanji's) also need the mask, `policy(observation, available)`.
 
     A recurrent policy (`qmix`, `vdn`) takes observations one at a time, in order, and `reset` begins a new episode.
     """
@@ -39,10 +38,10 @@ class RunPolicy:
             run: the run, or its directory.
             seed: one of the run's seeds; the default is the first.
             best: load the policy of the seed's best evaluation, instead of the last policy.
-            deterministic: always take the most likely choice, which PPO's policy samples otherwise.
+            deterministic: take the most likely choice, where PPO's policy samples choices.
 
         Raises:
-            LareError: the run has several agents, or has no such seed, or no checkpoint.
+            LareError: the run has several agents, no such seed, or no checkpoint.
         """
         run = as_run(run)
         seed_index = run.seed_index(seed)
@@ -65,16 +64,15 @@ class RunPolicy:
         self._memory = init_host_memory(self._config, 1, 1)
 
     def __call__(self, observation: Any, available: Any = None) -> Any:
-        """Return the action for an observation (n,), or the actions for a batch (batch, n), for the environment's own `step`.
+        """Return the action for an observation, or the actions for a batch, for the environment's own `step`.
 
         Args:
-            observation: the observation, or a batch.
-            available: which actions are available, (actions,) or (batch, actions). Needed if the environment has such masks, and refused
-                otherwise.
+            observation: the observation (n,), or a batch (batch, n).
+            available: which actions are available, (actions,) or (batch, actions): the mask, if the environment has masks.
 
         Raises:
-            LareError: observations or masks have another size, the environment has no masks, or a policy with a memory is called
-                with a batch.
+            LareError: an observation or a mask has another shape, the mask is missing or the environment has none, or a policy with a
+                memory is called with a batch.
         """
         rows, is_single = self._check_observation(observation)
         actions = to_package_action(self._select_actions(rows, available), self._env)
@@ -83,7 +81,7 @@ class RunPolicy:
     def select_env_action(self, observation: Any, available: Any = None) -> Float[np.ndarray, " action"]:
         """Return the action for one observation in the environment's units. A discrete action is one-hot, as in `JaxEnv.step`.
 
-        Raises `LareError` if the observation or the mask has another size, or there are several observations.
+        Raises `LareError` as a call does, and for a batch.
         """
         rows, is_single = self._check_observation(observation)
         if not is_single:
@@ -144,7 +142,7 @@ class RunPolicy:
         return with_available_action(mask.reshape(n_rows, size).astype(bool))
 
     def _check_observation(self, observation: Any) -> tuple[Float[np.ndarray, "batch observation"], bool]:
-        """Return observations as rows, and whether there is a single one."""
+        """Return the observations as rows, and whether the argument is a single observation."""
         rows = as_rows("observation", observation, self._env.observation_size)
         if not len(rows):
             raise LareError(f"the batch is empty: its shape is {rows.shape}")

@@ -1,4 +1,4 @@
-"""Returns of random actions and of a trained policy on some tasks, to which the returns of runs are compared."""
+"""Returns of random actions and of a trained policy on some tasks."""
 
 from typing import NamedTuple
 
@@ -11,8 +11,8 @@ class ReferenceReturns(NamedTuple):
     random: float
     """The mean over 20 episodes of uniformly random actions."""
     trained: float
-    """About the highest published return of TD3 on true rewards within a million steps, by Tianshou's benchmark or (Walker2d) by
-    TD3's paper."""
+    """About the highest published return of TD3 on true rewards within a million steps, from Tianshou's benchmark or, for Walker2d,
+    from the paper of TD3."""
 
 
 REFERENCE_RETURNS = {

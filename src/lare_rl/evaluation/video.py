@@ -24,18 +24,18 @@ from lare_rl.evaluation.policy import RunPolicy
 from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import make_jax_env
 from lare_rl.training.streams import Stream, episode_seed
-from lare_rl.util.files import check_new_path
+from lare_rl.util.files import check_new_path, write_bytes
 
 __all__ = ["check_video_path", "encode_film", "record_frames", "record_video", "write_video"]
 
-FRAMES_PER_SECOND = 8
-"""The frame rate of a film of many agents."""
-MAX_GIF_FRAMES_PER_SECOND = 25.0
-"""Drawing a frame may take long without a graphics card, so a GIF has at most 25 frames a second."""
+MANY_AGENTS_FPS = 8
+"""Frames per second of a film of many agents."""
+MAX_GIF_FPS = 25.0
+"""The most frames per second of a GIF, because drawing a frame may take long without a graphics card."""
 DEFAULT_FPS = 30
-"""Frames in a second of an environment that does not say how many it draws."""
+"""Frames per second of an environment that does not say how many it draws."""
 MAX_DRAWINGS = 200
-"""The most pictures of a film of a single agent in JAX, whose package may need a second for each."""
+"""The most frames of a film of a single agent in JAX, whose package may need a second for each."""
 FRAME_SIZE = {"width": 320, "height": 320}
 """Pixels of a MuJoCo film. The default, 480 by 480, takes twice the time and space."""
 FILM_WIDTH, FILM_QUALITY = 240, 55
@@ -51,8 +51,8 @@ def record_video(run: Run, path: str | Path, best: bool = False, deterministic: 
     """
     path = Path(path)
     check_video_path(path)
-    max_rate = MAX_GIF_FRAMES_PER_SECOND if path.suffix == ".gif" else math.inf
-    write_video(path, *record_frames(run, best, deterministic, max_rate=max_rate))
+    max_fps = MAX_GIF_FPS if path.suffix == ".gif" else math.inf
+    write_video(path, *record_frames(run, best, deterministic, max_fps=max_fps))
 
 
 def record_frames(
@@ -60,14 +60,14 @@ def record_frames(
     best: bool = False,
     deterministic: bool = False,
     *,
-    max_rate: float = MAX_GIF_FRAMES_PER_SECOND,
+    max_fps: float = MAX_GIF_FPS,
     max_frames: int | None = None,
     played: PlayedEpisodes | None = None,
 ) -> tuple[list[Frame], float]:
-    """Return the frames of one episode, as `record_video` shows it, and the seconds for which each is shown.
+    """Return the frames that `record_video` shows, and the seconds for which it shows each.
 
     Args:
-        max_rate: the largest number of frames in a second.
+        max_fps: the largest number of frames per second.
         max_frames: the largest number of frames. A longer film ends early; that of a single agent in JAX leaves steps out.
         played: episodes of a run with many agents; the film shows the first. By default, the policy plays new episodes.
 
@@ -86,20 +86,15 @@ def record_frames(
             )
         played = played or play_run(run)
         frames = make_jax_env(run.config.task).frames(*played.select_episode((played.state, played.credit)))
-        return frames[:max_frames], 1 / FRAMES_PER_SECOND
+        return frames[:max_frames], 1 / MANY_AGENTS_FPS
     policy = RunPolicy(run, best=best, deterministic=deterministic)
     if spec.is_jax:
-        return _play_and_draw(run, policy, min(max_frames or MAX_DRAWINGS, MAX_DRAWINGS)), 1 / MAX_GIF_FRAMES_PER_SECOND
-    camera = {"camera_name": "track", **FRAME_SIZE} if _has_tracking_camera(run) else {}
-    with closing(make_host_env(run.config.task, render_mode="rgb_array", **camera)) as env:
-        metadata = env.environment.metadata if isinstance(env, GymnasiumEnv) else {}
-        fps = metadata.get("render_fps", DEFAULT_FPS)
-        interval = max(1, math.ceil(fps / max_rate))
-        return _watch(run, env, policy, lambda: _render(env, run), interval, max_frames), interval / fps
+        return _play_and_draw(run, policy, min(max_frames or MAX_DRAWINGS, MAX_DRAWINGS)), 1 / MAX_GIF_FPS
+    return _record_on_host(run, policy, max_fps, max_frames)
 
 
 def encode_film(frames: Sequence[Frame], frame_seconds: float, max_bytes: int) -> bytes:
-    """Return an animated WebP of a small film. It ends early where it would be larger than `max_bytes`."""
+    """Return a small film as an animated WebP, which ends early if it would be larger than `max_bytes`."""
     images = _to_images(frames)
     for image in images:
         image.thumbnail((FILM_WIDTH, FILM_WIDTH))
@@ -108,6 +103,29 @@ def encode_film(frames: Sequence[Frame], frame_seconds: float, max_bytes: int) -
         if len(film) <= max_bytes or len(images) == 1:
             return film
         images = images[: max(1, int(0.95 * len(images) * max_bytes / len(film)))]
+
+
+def check_video_path(path: Path) -> None:
+    """Raise `LareError` if a video could not be written. Call this before the work is done."""
+    if path.suffix not in (".gif", ".mp4"):
+        raise LareError(f"{path} is no name of a video: it ends in .gif, or in .mp4 with the extra lare-rl[video]")
+    package, extra = ("imageio", "video") if path.suffix == ".mp4" else ("PIL", "report")
+    if find_spec(package) is None:
+        raise missing_extra_error(f"a film in {path.suffix}", extra)
+    check_new_path(path, overwrite=True)
+
+
+def write_video(path: Path, frames: Sequence[Frame], frame_seconds: float) -> None:
+    """Write a film whose frames are shown for `frame_seconds` each. Raise `LareError` if that fails."""
+    if path.suffix == ".gif":
+        write_bytes(path, _encode(_to_images(frames), "GIF", frame_seconds))
+        return
+    try:
+        import imageio.v3 as imageio
+
+        imageio.imwrite(path, list(frames), fps=1 / frame_seconds)
+    except (OSError, ValueError, ImportError, TypeError) as error:
+        raise LareError(f"the video {path} cannot be written: {error}; .mp4 needs lare-rl[video]") from error
 
 
 def _to_images(frames: Iterable[Frame]) -> list[Any]:
@@ -126,66 +144,51 @@ def _encode(images: Sequence[Any], file_format: str, frame_seconds: float, **opt
     return buffer.getvalue()
 
 
-def check_video_path(path: Path) -> None:
-    """Raise `LareError` if a video could not be written, before the work is done."""
-    if path.suffix not in (".gif", ".mp4"):
-        raise LareError(f"{path} is no name of a video: it ends in .gif, or in .mp4 with the extra lare-rl[video]")
-    package, extra = ("imageio", "video") if path.suffix == ".mp4" else ("PIL", "report")
-    if find_spec(package) is None:
-        raise missing_extra_error(f"a film in {path.suffix}", extra)
-    check_new_path(path, overwrite=True)
-
-
-def write_video(path: Path, frames: Sequence[Frame], frame_seconds: float) -> None:
-    """Write frames that are shown for `frame_seconds` each. Raise `LareError` if that fails."""
-    try:
-        if path.suffix == ".gif":
-            path.write_bytes(_encode(_to_images(frames), "GIF", frame_seconds))
-            return
-        import imageio.v3 as imageio
-
-        imageio.imwrite(path, list(frames), fps=1 / frame_seconds)
-    except (OSError, ValueError, ImportError, TypeError) as error:
-        hint = ".gif needs lare-rl[report], .mp4 needs lare-rl[video]"
-        raise LareError(f"the video {path} cannot be written: {error}; {hint}") from error
+def _record_on_host(run: Run, policy: RunPolicy, max_fps: float, max_frames: int | None) -> tuple[list[Frame], float]:
+    camera = {"camera_name": "track", **FRAME_SIZE} if _has_tracking_camera(run) else {}
+    with closing(make_host_env(run.config.task, render_mode="rgb_array", **camera)) as env:
+        metadata = env.environment.metadata if isinstance(env, GymnasiumEnv) else {}
+        fps = metadata.get("render_fps", DEFAULT_FPS)
+        interval = max(1, math.ceil(fps / max_fps))
+        return _play_and_capture(run, env, policy, lambda: _render(env, run), interval, max_frames), interval / fps
 
 
 def _play_and_draw(run: Run, policy: RunPolicy, max_frames: int) -> list[Frame]:
-    """Play an episode of an environment of pure functions, and draw the states in which the policy acts, or some of many."""
+    """Play an episode of an environment in JAX. Draw the states in which the policy acts, or some of them if there are many."""
     env = make_host_env(run.config.task)
     assert isinstance(env, JaxOnHost)
-    states = _watch(run, env, policy, lambda: env.state)
+    states = _play_and_capture(run, env, policy, lambda: env.state)
     states = states[:: math.ceil(len(states) / max_frames)]
     return env.env.frames(jax.tree.map(lambda *leaves: np.stack(leaves), *states))
 
 
-def _watch(
+def _play_and_capture(
     run: Run,
     env: HostEnv,
     policy: RunPolicy,
-    look: Callable[[], Any],
+    capture: Callable[[], Any],
     interval: int = 1,
-    max_frames: int | None = None,
+    max_captures: int | None = None,
 ) -> list[Any]:
-    """Play an episode. Return what `look` returns at every `interval`-th timestep at which the policy acts, at most `max_frames`."""
-    seen, steps = [], count()
+    """Play an episode. Return what `capture` returns before every `interval`-th action, at most `max_captures`."""
+    captures, steps = [], count()
 
     def act(*inputs: np.ndarray) -> np.ndarray:
         if next(steps) % interval == 0:
-            seen.append(look())
+            captures.append(capture())
         return policy.select_env_action(*inputs)
 
     seed = episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0)
     for _ in play_steps(env, act, np.random.default_rng(0), seed):
-        if len(seen) == max_frames:
+        if len(captures) == max_captures:
             break
-    return seen
+    return captures
 
 
 def _render(env: HostEnv, run: Run) -> Frame:
     try:
         with warnings.catch_warnings():
-            # Graphics libraries warn if they find no screen, although another one may not need it.
+            # Graphics libraries warn if they find no screen, although another library may need none.
             warnings.simplefilter("ignore")
             pixels = np.asarray(env.render())
         if pixels.ndim != 3:

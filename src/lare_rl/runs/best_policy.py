@@ -2,8 +2,7 @@
 
     checkpoint/best.npz     the arrays that are needed to act; return and step of each seed
 
-The best of many evaluations overestimates its policy. So `lare-rl evaluate --best` plays it from initial states that
-none of them has used.
+The best of many evaluations overestimates its policy. So `lare-rl evaluate --best` begins in other initial states.
 """
 
 from pathlib import Path
@@ -15,7 +14,7 @@ from jaxtyping import Float, Int
 
 from lare_rl.errors import LareError
 from lare_rl.runs.checkpoint import fill_template, named_leaves
-from lare_rl.util.files import make_directory, replace_npz
+from lare_rl.util.files import make_directory, remove_partial_files, replace_npz
 from lare_rl.util.npz import open_npz, report_damage
 
 __all__ = ["BEST_FILE", "BestPolicy", "empty_best", "load_best", "save_best", "update_best"]
@@ -31,7 +30,7 @@ class BestPolicy(NamedTuple):
     step: Int[np.ndarray, " seeds"]
     """The environment step of that evaluation."""
     actor: Any
-    """The arrays that are needed to act as in that evaluation; None before the first."""
+    """What acted in that evaluation; None before the first."""
 
 
 def empty_best(n_seeds: int) -> BestPolicy:
@@ -40,7 +39,7 @@ def empty_best(n_seeds: int) -> BestPolicy:
 
 
 def update_best(best: BestPolicy, return_: Float[np.ndarray, " seeds"], step: int, actor: Any) -> BestPolicy:
-    """Replace the policy of each seed whose evaluation is better than all earlier ones. NaN is never better."""
+    """Replace the policy of each seed whose return exceeds its best. NaN never does."""
     is_better = np.asarray(return_) > best.return_
 
     def choose(old: Any, new: Any) -> np.ndarray:
@@ -57,19 +56,14 @@ def update_best(best: BestPolicy, return_: Float[np.ndarray, " seeds"], step: in
 def save_best(directory: Path, best: BestPolicy) -> None:
     """Write the best policies into a checkpoint's directory. Raises `LareError` if they cannot be written."""
     make_directory(directory)
-    for partial_file in directory.glob(f"{BEST_FILE}.*.new"):  # of a process that was killed while it wrote
-        partial_file.unlink(missing_ok=True)
+    remove_partial_files(directory / BEST_FILE)
     replace_npz(directory / BEST_FILE, named_leaves(best))
 
 
 def load_best(directory: Path, actor_shape: Any, n_seeds: int) -> BestPolicy:
-    """Read the best policies from a checkpoint's directory.
+    """Read the best policies from a checkpoint's directory. `actor_shape` is an actor, whose leaves may be shapes.
 
-    Args:
-        actor_shape: an actor, whose leaves may be shapes.
-
-    Raises:
-        LareError: there is no such file, or it has another structure.
+    Raises `LareError` if there is no such file, or it has another structure.
     """
     path = directory / BEST_FILE
     if not path.is_file():

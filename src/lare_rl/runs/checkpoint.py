@@ -1,11 +1,11 @@
 """Checkpoints that stay valid if the process is killed at any moment. Each row of the replay is written once.
 
     checkpoint/
-      rows-0.npz, rows-1.npz, ...   the replay's rows, in the order in which they came
+      rows-0.npz, rows-1.npz, ...   the replay's rows, from old to new
       state.npz                     everything else, and the list of the row files in use
 
-A row file never changes. It is deleted when no row of it is in the replay any more. A new `state.npz` is written next to the old one,
-and then replaces it. So `state.npz` always lists complete row files. No pickle anywhere.
+A row file never changes. It is deleted when no row of it is in the replay any more. A new `state.npz` replaces the old file when it is
+complete. So `state.npz` always lists complete row files. No file contains a pickle.
 """
 
 import json
@@ -19,32 +19,21 @@ import numpy as np
 
 from lare_rl.errors import LareError, short_repr
 from lare_rl.runs.metrics_file import MAX_INTEGER
-from lare_rl.util.files import make_directory, replace_npz
+from lare_rl.util.files import make_directory, remove_partial_files, replace_npz
 from lare_rl.util.npz import DAMAGED_FILE_ERRORS, open_npz, report_damage
 from lare_rl.util.renamed_fields import rename_fields
+from lare_rl.util.rows import padded_size
 from lare_rl.util.safe_io import read_json, read_json_object
-from lare_rl.util.shapes import padded_size
 
-__all__ = [
-    "STATE_FILE",
-    "fill_template",
-    "load",
-    "named_leaves",
-    "read_metadata",
-    "take_snapshot",
-    "write",
-]
+__all__ = ["STATE_FILE", "fill_template", "load", "named_leaves", "read_metadata", "take_snapshot", "write"]
 
 STATE_FILE = "state.npz"
-
 METADATA, ROW_FILES = "host", "segments"
-"""The names in `state.npz` of the metadata and of the list of row files, both as JSON. The names of a state's arrays begin with a dot."""
-
+"""The names in `state.npz` of the metadata and of the list of row files, both in JSON. The names of a state's arrays begin with a dot."""
 REPLAY = ".replay."
 """The path of the replay within the state."""
 SAVED_BY_ROW = f"{REPLAY}columns"
 """The path of the arrays that are saved by row."""
-
 NEW_STATE = (
     *(".closed_form.strengths.", ".closed_form.intercept", ".closed_form.start_value"),
     *(".is_log_odds", ".predictions.level", ".score_type_predictions.level"),
@@ -76,19 +65,20 @@ class _RowFile:
 
 
 class Snapshot(NamedTuple):
-    """What a checkpoint adds and replaces, as NumPy arrays that nothing else changes."""
+    """The files that a checkpoint adds and replaces, as NumPy arrays that nothing else changes."""
 
-    rows_file: str
+    row_file: str
+    """The name of the new row file."""
     rows: dict[str, np.ndarray]
     state: dict[str, np.ndarray]
     used_files: set[str]
-    """The files of rows that are in use."""
+    """The names of the row files in use."""
 
 
 def take_snapshot(
     directory: Path, learner: Any, metadata: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
 ) -> Snapshot:
-    """Copy from the device what the next checkpoint will hold. The last one must have been written.
+    """Copy what the next checkpoint saves from the device. The last checkpoint must have been written.
 
     Args:
         metadata: other data to save, as JSON.
@@ -99,8 +89,8 @@ def take_snapshot(
     if (directory / STATE_FILE).exists():
         with open_npz(directory / STATE_FILE) as saved:
             start, row_files = saved[".replay.next_row"], _parse_row_files(saved[ROW_FILES])
-    # The last saved row is saved again, because it held only the newest observation then. And if an episode has just
-    # been dropped, `end` is smaller than before. Of more new rows than the capacity, only the last ones exist.
+    # The last saved row is saved again, because it held only the newest observation then. If an episode has just been
+    # dropped, `end` is smaller than before. Of more new rows than the capacity, only the last exist.
     start = np.minimum(np.maximum(start, end - capacity + 1), end)
     count = end - start + 1
     width = padded_size(int(count.max()))
@@ -113,10 +103,10 @@ def take_snapshot(
     state[METADATA] = np.array(json.dumps(metadata))
     state[ROW_FILES] = np.array(json.dumps([asdict(row_file) for row_file in in_use]))
     return Snapshot(
-        rows_file=newest.filename,
+        row_file=newest.filename,
         rows={name: np.array(values[:, :, : count.max()]) for name, values in jax.device_get(rows).items()},
         state=state,
-        # Not always the newest ones: a file from before a drop may reach further.
+        # These are not always the newest files: a file from before a dropped episode may reach further.
         used_files={row_file.filename for row_file in in_use},
     )
 
@@ -124,10 +114,9 @@ def take_snapshot(
 def write(directory: Path, snapshot: Snapshot) -> None:
     """Write a checkpoint. Raises `LareError` if it cannot be written."""
     make_directory(directory)
-    for pattern in ("rows-*.new", f"{STATE_FILE}.*.new"):  # of a process that was killed while it wrote
-        for partial_file in directory.glob(pattern):
-            partial_file.unlink(missing_ok=True)
-    replace_npz(directory / snapshot.rows_file, snapshot.rows)
+    for name in ("rows-*", STATE_FILE):
+        remove_partial_files(directory / name)
+    replace_npz(directory / snapshot.row_file, snapshot.rows)
     replace_npz(directory / STATE_FILE, snapshot.state)
     for path in directory.glob("rows-*.npz"):
         if path.name not in snapshot.used_files:
@@ -135,16 +124,11 @@ def write(directory: Path, snapshot: Snapshot) -> None:
 
 
 def load(directory: Path, template: State) -> tuple[State, dict[str, Any], dict[str, np.ndarray]]:
-    """Read a checkpoint.
+    """Return a saved training state, and its `metadata` and `arrays`.
 
-    Args:
-        template: a training state of the same structure, whose leaves may be shapes.
+    The template is a training state of the same structure, whose leaves may be shapes.
 
-    Returns:
-        The training state, and `metadata` and `arrays` as saved.
-
-    Raises:
-        LareError: there is no checkpoint, or it has another structure.
+    Raises `LareError` if there is no checkpoint, or it has another structure.
     """
     path = directory / STATE_FILE
     if not path.is_file():
@@ -174,12 +158,11 @@ def named_leaves(state: Any) -> dict[str, Any]:
 
 
 def fill_template(template: State, arrays: Mapping[str, np.ndarray]) -> State:
-    """Replace the leaves of a template by saved arrays. A leaf that is a NumPy array stays one, and may have 64 bits.
+    """Replace the leaves of a template by saved arrays, whose names may be of an earlier version.
 
-    A name that the template does not have may be of an earlier version.
+    A leaf that is a NumPy array, which may have 64 bits, stays a NumPy array.
 
-    Raises:
-        ValueError: an array is missing, or a shape or a type differs.
+    Raises `ValueError` if an array is missing, or if a shape or a type differs.
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     names = [jax.tree_util.keystr(path) for path, _ in leaves]
@@ -189,12 +172,13 @@ def fill_template(template: State, arrays: Mapping[str, np.ndarray]) -> State:
         if name.startswith(SAVED_BY_ROW):
             filled.append(leaf)
             continue
-        if name not in arrays and any(path in name for path in NEW_STATE):
+        array = arrays.get(name)
+        if array is None:
+            if not any(path in name for path in NEW_STATE):
+                raise ValueError(f"{name} is missing")
             array = np.zeros(leaf.shape, leaf.dtype)
-        elif name not in arrays:
-            raise ValueError(f"{name} is missing")
-        else:
-            array = _pad_rows(arrays[name], leaf.shape) if name.startswith(REPLAY) else arrays[name]
+        if name.startswith(REPLAY):
+            array = _extend_replay(array, leaf.shape)
         if array.shape != leaf.shape:
             raise ValueError(f"{name} has shape {array.shape}, not {leaf.shape}")
         if array.dtype != leaf.dtype:
@@ -203,21 +187,22 @@ def fill_template(template: State, arrays: Mapping[str, np.ndarray]) -> State:
     return jax.tree.unflatten(structure, filled)
 
 
-def _pad_rows(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Pad an array of a smaller replay with zeros. Return any other array unchanged.
+def _extend_replay(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Append zeros to an array of a smaller replay. Return any other array unchanged.
 
-    A run that was extended may have a larger replay. The smaller one had room for every step, so its rows keep their places.
+    A run that was extended may have a larger replay. The smaller replay had room for every step, so its rows keep their indices.
     """
     seeds_envs, rows, rest = array.shape[:2], array.shape[2:3], array.shape[3:]
     if not rows or (seeds_envs, rest) != (shape[:2], shape[3:]) or rows > shape[2:3]:
         return array
-    padding = np.zeros((*seeds_envs, shape[2] - rows[0], *rest), array.dtype)
-    return np.concatenate([array, padding], axis=2)
+    zeros = np.zeros((*seeds_envs, shape[2] - rows[0], *rest), array.dtype)
+    return np.concatenate([array, zeros], axis=2)
 
 
 def _load_rows(learner: Any, directory: Path, row_files: list[_RowFile]) -> Any:
+    """Return the learner with the saved rows of its replay."""
     capacity, columns = _capacity(learner), dict(learner.replay.columns)
-    for name, column in columns.items():  # one after the other, so that only one is in memory twice
+    for name, column in columns.items():  # by column, so that no more than one is in memory twice
         buffer = np.zeros(column.shape, column.dtype)
         for row_file in row_files:
             with open_npz(directory / row_file.filename) as saved:
@@ -235,7 +220,7 @@ def _load_rows(learner: Any, directory: Path, row_files: list[_RowFile]) -> Any:
 
 
 def _put_like(template: Any, array: np.ndarray) -> jax.Array:
-    """Copy an array to the devices that a shape names, or to JAX's default device."""
+    """Copy an array to the devices of a `ShapeDtypeStruct`, else to JAX's default device."""
     return jax.device_put(array, template.sharding if isinstance(template, jax.ShapeDtypeStruct) else None)
 
 
@@ -252,7 +237,7 @@ def _capacity(learner: Any) -> int:
 
 
 def _parse_metadata(text: Any) -> dict[str, Any]:
-    """Read the data that are saved as JSON. Raise `ValueError` if they are not valid."""
+    """Read the metadata from JSON. Raise `ValueError` if they are not valid."""
     metadata = read_json_object(str(text))
     _check_counts([metadata[name] for name in ("step", "metrics_length") if name in metadata])
     digests = metadata.get("function_sha256", [])
@@ -262,7 +247,7 @@ def _parse_metadata(text: Any) -> dict[str, Any]:
 
 
 def _parse_row_files(text: Any) -> list[_RowFile]:
-    """Read the list of the row files in use. Raise `ValueError` if it is not valid."""
+    """Read the list of row files from JSON. Raise `ValueError` if it is not valid."""
     names = ("number", "start", "count")
     return [_RowFile(**{name: _check_counts(values[name]) for name in names}) for values in read_json(str(text))]
 

@@ -23,13 +23,12 @@ from lare_rl.util.safe_io import read_table
 __all__ = ["CONFIG", "Config", "make_config", "read_config", "write_config"]
 
 MAX_CONFIG_BYTES = 8 << 20
-
 VERSIONED_PACKAGES = ("jax", "optax", "gymnasium", "mujoco", "numpy")
 """Packages that results depend on."""
 
 
 class Config(CheckedModel):
-    """config.json."""
+    """The contents of config.json."""
 
     format: int
     lare: str
@@ -44,11 +43,11 @@ class Config(CheckedModel):
     versions: dict[str, str]
     machine: str
     ended_at: tuple[int, ...] = ()
-    """The number of steps of the run before each time that it was extended."""
+    """The run's number of steps before each extension."""
 
 
 def make_config(task: TaskSpec, settings: ResolvedSettings, functions: Sequence[LatentFunction]) -> Config:
-    """Return everything that a new run depends on."""
+    """Return the configuration of a new run."""
     return Config(
         format=FORMAT,
         lare=code_version(),
@@ -71,7 +70,7 @@ def _find_versions() -> dict[str, str]:
 
 
 def _describe_cores() -> str:
-    # XLA divides sums among the cores that the process may use, and this decides how they are rounded.
+    # XLA divides sums among the cores that the process may use, which affects their rounding.
     n_cores = os.cpu_count() or 1
     n_usable = n_usable_cores()
     return f"{n_usable} of {n_cores} cores" if n_usable < n_cores else f"{n_cores} cores"
@@ -79,8 +78,7 @@ def _describe_cores() -> str:
 
 def write_config(directory: Path, config: Config) -> None:
     """Write config.json. Raises `LareError` if it cannot be written."""
-    text = config.model_dump_json(indent=1) + "\n"
-    write_bytes(directory / CONFIG, text.encode())
+    write_bytes(directory / CONFIG, f"{config.model_dump_json(indent=1)}\n".encode())
 
 
 def read_config(directory: Path) -> Config:

@@ -1,7 +1,7 @@
 """The run directory: the files of a run, and functions that make and open it.
 
 config.json          see config_file.py
-latent_function.py   phi, with its replies and checks in .json. With several teams, one latent_function_TEAM.py for each.
+latent_function.py   phi; its replies and checks are in latent_function.json. Several teams have a latent_function_TEAM.py each.
 metrics.jsonl        see metrics_file.py
 checkpoint/          see checkpoint.py
 failed_batch.npz     the input of the latent function, if it failed
@@ -46,7 +46,7 @@ CHECKPOINT = "checkpoint"
 
 
 class RunBusyError(LareError):
-    """Another process is training in the run's directory."""
+    """Another process trains in the run's directory."""
 
 
 @dataclass(frozen=True)
@@ -119,9 +119,9 @@ def create_run(directory: Path, task: TaskSpec, settings: ResolvedSettings, func
 
 
 def extend_run(run: Run, steps: int) -> Run:
-    """Return the run with a larger number of steps, rounded up to whole iterations. It is written to config.json.
+    """Return the run with a larger number of steps, rounded up to whole iterations, and write that to config.json.
 
-    Raises `LareError` if the number is smaller than before.
+    Raises `LareError` if the number is smaller than before, or the file cannot be written.
     """
     settings = run.config.settings
     steps = round_up(steps, settings.iteration_steps)
@@ -139,10 +139,9 @@ def extend_run(run: Run, steps: int) -> Run:
 
 
 def open_run(directory: str | Path) -> Run:
-    """Open a run directory. Its latent functions are read and verified again.
+    """Open a run directory. Its latent functions are verified again.
 
-    Raises:
-        LareError: it is not a run, its files are not valid, or its environment is in a file that the user does not trust.
+    Raises `LareError` if it is not a run, a file is not valid, or its environment is in a file that the user does not trust.
     """
     directory = Path(directory)
     config = read_config(directory)
@@ -169,8 +168,7 @@ def as_run(run: Run | str | Path) -> Run:
 
 def default_directory(task: TaskSpec, settings: ResolvedSettings) -> Path:
     """Return runs/TASK-METHOD-ALGORITHM-sSEED, with a number appended if that exists."""
-    name = f"{task.name}-{settings.method}-{settings.algorithm}-s{settings.seed}"
-    return find_free_path(Path("runs"), name)
+    return find_free_path(Path("runs"), f"{task.name}-{settings.method}-{settings.algorithm}-s{settings.seed}")
 
 
 def function_filename(task: TaskSpec, role: TaskSpec) -> str:
@@ -187,7 +185,7 @@ def function_paths(directory: Path, config: Config) -> list[tuple[TaskSpec, Path
     if not digests:
         return []
     if replacements := sorted(directory.glob("latent_function*-*.py")):
-        # Until format 4, a run could replace phi while it trained. Its checkpoint has the hash of the one in use.
+        # Until format 4, a run could replace phi while it trained. Its checkpoint has the hash of the last phi.
         digests = tuple((read_metadata(directory / CHECKPOINT) or {}).get("function_sha256", digests))
     if len(digests) != len(roles):
         raise LareError(f"{directory}: there are {len(digests)} latent functions for {len(roles)} roles")
@@ -217,10 +215,9 @@ def lock_run(run: Run) -> Iterator[None]:
 
 
 def find_run_directories(paths: Sequence[Path]) -> list[Path]:
-    """Return the runs among some paths and up to two levels below them, in the order of the paths.
+    """Return the runs among some paths and up to two levels below them, in the order of the paths, each once.
 
-    A run that is found twice counts once, at its first path. The log that a sweep writes next to the directory of a run is
-    skipped, so `DIRECTORY/*` may be passed.
+    The log that a sweep writes next to the directory of a run is skipped, so `DIRECTORY/*` may be passed.
 
     Raises `LareError` if there is no path, or a path contains no run.
     """

@@ -1,6 +1,6 @@
 """The metrics in a run's metrics.jsonl, and what they mean. docs/reference/metrics.md is made from this table.
 
-With several teams, each has its own, which ends in `_` and the team's name.
+With several teams, each team has its own metrics, whose names end in `_` and the name of the team.
 """
 
 from collections.abc import Mapping
@@ -74,7 +74,7 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
         "critic/value": "Mean target of the team's value, over these steps.",
     },
     "CreditAssigner only": {
-        "credit/episodes": "Number of payments that were learned from or wait: of ended episodes, if each is paid once.",
+        "credit/episodes": "Number of payments that were learned from or still wait. If episodes are paid once: of ended episodes.",
         "credit/dropped": "Number of episodes that were dropped.",
         "credit/fits": "Number of gradient updates of the decoder; 0 for a closed form.",
     },

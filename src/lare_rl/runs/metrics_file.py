@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from lare_rl.errors import LareError
+from lare_rl.util.files import report_write_error
 from lare_rl.util.renamed_fields import rename_metrics
 from lare_rl.util.safe_io import read_json, read_text
 
 __all__ = ["MAX_INTEGER", "append_metrics", "read_metrics", "truncate_metrics"]
 
 METRICS_FILE = "metrics.jsonl"
-
 MAX_METRICS_BYTES = 512 << 20
-
 MAX_INTEGER = 2**53
 """A larger whole number may change when it becomes a float."""
 
@@ -30,38 +29,39 @@ def read_metrics(directory: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     stat = path.stat()
-    return list(_parse(path, (stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns)))
+    return list(_parse_lines(path, (stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns)))
 
 
 def append_metrics(directory: Path, lines: Sequence[dict[str, Any]]) -> int:
-    """Append lines to metrics.jsonl, and return the new size of the file in bytes."""
+    """Append lines to metrics.jsonl, and return the new size of the file in bytes. Raises `LareError` if that fails."""
     path = directory / METRICS_FILE
-    try:
-        with path.open("a", encoding="utf-8", newline="\n") as file:
-            file.write("".join(json.dumps(line) + "\n" for line in lines))
-            file.flush()
-            os.fsync(file.fileno())
-            return file.tell()
-    except OSError as error:
-        raise LareError(f"{path} cannot be written: {error.strerror or error}; the last checkpoint is whole") from error
+    with (
+        report_write_error(path, "; the last checkpoint is whole"),
+        path.open("a", encoding="utf-8", newline="\n") as file,
+    ):
+        file.write("".join(json.dumps(line) + "\n" for line in lines))
+        file.flush()
+        os.fsync(file.fileno())
+        return file.tell()
 
 
 def truncate_metrics(directory: Path, n_bytes: int) -> None:
     """Remove the lines that were written after a checkpoint. Resumed training writes them again.
 
-    Raises `LareError` if lines from before the checkpoint are missing.
+    Raises `LareError` if lines from before the checkpoint are missing, or the file cannot be written.
     """
     path = directory / METRICS_FILE
     size = path.stat().st_size if path.exists() else 0
     if size < n_bytes:
         raise LareError(f"{path} has {size} bytes, and the checkpoint needs {n_bytes}: was it copied during training?")
     if size > n_bytes:
-        os.truncate(path, n_bytes)
+        with report_write_error(path):
+            os.truncate(path, n_bytes)
 
 
 @functools.lru_cache(maxsize=32)  # a report reads the metrics of a run twenty times
-def _parse(path: Path, state: tuple[int, ...]) -> list[dict[str, Any]]:
-    """Return the lines of a file, which has not changed while its `state` is the same."""
+def _parse_lines(path: Path, version: tuple[int, ...]) -> list[dict[str, Any]]:
+    """Return the lines of a file. While its `version` is the same, it has not changed."""
     lines = []
     for number, text in enumerate(read_text(path, MAX_METRICS_BYTES).split("\n")[:-1], start=1):
         try:
@@ -75,7 +75,7 @@ def _parse(path: Path, state: tuple[int, ...]) -> list[dict[str, Any]]:
 
 
 def _is_evaluation(line: Any) -> bool:
-    """Return whether a value is a step, a seed, and numbers by name."""
+    """Return whether a value is an object with a step, a seed, and numbers or null."""
     return (
         isinstance(line, dict)
         and all(type(line.get(name)) is int and 0 <= line[name] <= MAX_INTEGER for name in ("step", "seed"))

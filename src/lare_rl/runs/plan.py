@@ -21,7 +21,6 @@ from lare_rl.util.safe_io import read_table
 
 if TYPE_CHECKING:
     from lare_rl.latent.function import LatentFunction
-    from lare_rl.runs.directory import Run
 
 __all__ = ["RunPlan", "load_config"]
 
@@ -37,7 +36,7 @@ class RunPlan:
     source: Path | None = None
     """The file, or the directory of the run."""
     is_run: bool = False
-    """Whether it is the configuration of an earlier run. All settings are then decided."""
+    """Whether it is the configuration of an earlier run, which has all settings."""
 
     @property
     def values(self) -> dict[str, Any]:
@@ -55,9 +54,9 @@ class RunPlan:
         return get(self.values) == get(settings.model_dump())
 
     def function_for(self, settings: ResolvedSettings) -> "tuple[Path | LatentFunction, ...]":
-        """Return the functions of the file for the settings of a run. There are none if another method needs none."""
-        replaced = settings.method != self.settings.method and not METHODS.find(settings.method).needs_phi
-        return () if replaced else self.function or ()
+        """Return the functions of the file for a run with these settings. There are none if the user chose a method without phi."""
+        chose_without_phi = settings.method != self.settings.method and not METHODS.find(settings.method).needs_phi
+        return () if chose_without_phi else self.function or ()
 
 
 class _PlanFile(Settings):
@@ -111,17 +110,11 @@ def load_config(path: str | Path) -> RunPlan:
 
 
 def _plan_repetition(directory: Path) -> RunPlan:
-    """Return the plan of a run like an earlier one."""
+    """Return the plan that repeats a run, with the settings that it used."""
+    from lare_rl.config.effective import unused_names
     from lare_rl.runs.directory import open_run
 
     run = open_run(directory)
-    return RunPlan(run.config.task, _used_settings(run), run.functions or None, source=directory, is_run=True)
-
-
-def _used_settings(run: "Run") -> Settings:
-    """Return the settings that a run used."""
-    from lare_rl.config.effective import unused_names
-
     resolved = run.config.settings
     values = resolved.model_dump()
     values[resolved.algorithm] = values.pop("hyperparameters")
@@ -129,4 +122,4 @@ def _used_settings(run: "Run") -> Settings:
     for name in unused_names(resolved):
         table, _, key = name.rpartition(".")
         (values[table] if table else values).pop(key)
-    return Settings(**values)
+    return RunPlan(run.config.task, Settings(**values), run.functions or None, source=directory, is_run=True)

@@ -1,4 +1,4 @@
-"""Planned runs (jobs): their directories, their progress, and their training."""
+"""Jobs, which are planned runs: their directories, their progress, and their training."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,6 @@ from lare_rl.training.latent_functions import choose_functions
 
 __all__ = ["Job", "check_job", "job_to_json", "make_job", "train_job"]
 
-
 ANOTHER_OUT = "choose another output directory (--out)"
 
 
@@ -34,15 +33,15 @@ class Job:
     directory: Path
     task: TaskSpec
     settings: Settings
-    """As the user gives them."""
+    """The settings that the user chose."""
     resolved: ResolvedSettings
-    """With all defaults."""
+    """These settings with all defaults."""
     functions: tuple[Path, ...] = ()
-    """Files of latent functions instead of the recorded ones, one for each team."""
+    """Files of latent functions, one for each team. Empty if the recorded replies are used."""
 
     @property
     def name(self) -> str:
-        """The last two parts of the directory: TASK/RUN."""
+        """TASK/RUN, the end of the directory's path."""
         return f"{self.directory.parent.name}/{self.directory.name}"
 
     @property
@@ -51,7 +50,7 @@ class Job:
         return (self.directory / CONFIG).is_file()
 
     def step(self) -> int:
-        """Return the step of the checkpoint or, without one that can be read, of the last evaluation.
+        """Return the step of the checkpoint or, if none can be read, of the last evaluation.
 
         Raises `LareError` if the metrics are damaged.
         """
@@ -66,14 +65,9 @@ class Job:
         last_step = self.resolved.steps
         try:
             seeds = {line["seed"] for line in read_metrics(self.directory) if line["step"] == last_step}
+            return self.started and seeds == set(self.resolved.all_seeds) and self.step() == last_step
         except LareError:
             return False
-        checkpoint = read_metadata(self.directory / CHECKPOINT)
-        return (
-            self.started
-            and seeds == set(self.resolved.all_seeds)
-            and (checkpoint is None or checkpoint["step"] == last_step)
-        )
 
 
 def make_job(root: Path, task: TaskSpec, settings: Settings, functions: Sequence[Path] = ()) -> Job:
@@ -98,7 +92,7 @@ def make_job(root: Path, task: TaskSpec, settings: Settings, functions: Sequence
 
 
 def check_job(job: Job) -> None:
-    """Raise `LareError` if a job could not be trained, or if its directory holds another run or other files."""
+    """Raise `LareError` if a job cannot be trained, or if its directory holds another run or other files."""
     method = METHODS.find(job.resolved.method)
     functions = choose_functions(job.task, job.resolved, job.functions) if job.functions else ()
     if not job.started:
@@ -114,10 +108,9 @@ def check_job(job: Job) -> None:
     old = effective_settings(config.settings)
     for name, value in effective_settings(job.resolved).items():
         if (old_value := old.get(name)) != value:
-            more = (
-                f"extend it with lare-rl train --resume {job.directory} --steps {value}, or " if name == "steps" else ""
-            )
-            raise LareError(f"{job.directory} holds a run with {name} = {old_value}, not {value}: {more}{ANOTHER_OUT}")
+            extend = f"extend it with lare-rl train --resume {job.directory} --steps {value}, or "
+            hint = f"{extend if name == 'steps' else ''}{ANOTHER_OUT}"
+            raise LareError(f"{job.directory} holds a run with {name} = {old_value}, not {value}: {hint}")
     if functions and config.function_sha256 != tuple(function.digest for function in functions):
         raise LareError(f"{job.directory} holds a run with another latent function: {ANOTHER_OUT}")
 

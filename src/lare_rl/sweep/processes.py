@@ -29,7 +29,7 @@ from lare_rl.util.processes import own_session
 __all__ = ["RunningProcesses", "train_in_process", "train_in_processes", "train_on_ray"]
 
 LOCK_TIMEOUT_S = 60.0
-"""Time to wait for an earlier process that is still saving the run."""
+"""Time to wait for an earlier process that still saves the run."""
 
 
 def train_in_processes(
@@ -37,7 +37,7 @@ def train_in_processes(
 ) -> Generator[tuple[Job, str | None], None, None]:
     """Train several jobs at a time. Yield each job when it ends, and its error or None.
 
-    Closing the generator stops all jobs. Running jobs save a checkpoint first.
+    Closing the generator stops all jobs, after they have saved a checkpoint.
 
     Raises `LareError` if there are not enough cores or accelerators.
     """
@@ -67,7 +67,7 @@ def train_in_processes(
 
 
 class RunningProcesses:
-    """Processes that can be stopped together. After that, no process is started."""
+    """Processes that can be stopped together. After that, none is started."""
 
     def __init__(self):
         self._processes: set[subprocess.Popen] = set()
@@ -99,16 +99,15 @@ class RunningProcesses:
 
 
 def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | None:
-    """Train one job in a new process, which writes its output to RUN.log. Return the error, or None."""
+    """Train a job in a new process, which writes its output to RUN.log. Return the error, or None."""
     make_directory(job.directory.parent)
     log = job.directory.with_name(job.directory.name + ".log")
     request = json.dumps({"job": job_to_json(job), "cores": slot.cores})
     with log.open("a", encoding="utf-8") as file:
         log_start = file.tell()
-        command = [sys.executable, "-P", "-m", "lare_rl.sweep.processes"]
         # In its own session, so that Ctrl-C reaches it only once, through this process.
         process = running.start(
-            command,
+            [sys.executable, "-P", "-m", "lare_rl.sweep.processes"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=file,
@@ -121,7 +120,6 @@ def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | N
             return "it was not started, because the sweep was stopped"
         assert process.stdin is not None
         assert process.stdout is not None
-        error = ""
         try:
             with contextlib.suppress(OSError, ValueError):  # the process has ended, or `stop` has closed its input
                 process.stdin.write(request + "\n")
@@ -135,7 +133,7 @@ def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | N
             running.remove(process)
     if process.returncode == 0:
         return None if job.done else f"it ended at step {job.step()} of {job.resolved.steps} ({log})"
-    if process.returncode < 0:  # a killed process, perhaps for its memory, has sent no error
+    if process.returncode < 0:  # a killed process has sent no error
         names = {number.value: number.name for number in signal.Signals}  # real-time signals have none
         error = f"it was ended by {names.get(-process.returncode, f'signal {-process.returncode}')}"
     elif not error:  # the error that was sent comes first, because a full disk may cut the log short
@@ -148,7 +146,7 @@ def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | N
 def train_on_ray(
     jobs: Sequence[Job], resources: Resources, address: str
 ) -> Generator[tuple[Job, str | None], None, None]:
-    """Train jobs on a Ray cluster, each on its cores and accelerators. Yield each job when it ends, and its error or None.
+    """Train jobs on a Ray cluster. Yield each job when it ends, and its error or None.
 
     All machines must share the directory of the runs.
 
@@ -167,12 +165,8 @@ def train_on_ray(
     try:
         accelerators = resources.accelerators or 0
         variables = {PREALLOCATE: "false"} if 0 < accelerators < 1 else {}
-        options: dict[str, Any] = {
-            "num_cpus": resources.cores,
-            "num_gpus": accelerators,
-            "runtime_env": {"env_vars": variables},
-        }
-        remote = ray.remote(**options, max_calls=1)(_train_when_free)
+        options: dict[str, Any] = {"num_cpus": resources.cores, "num_gpus": accelerators, "max_calls": 1}
+        remote = ray.remote(**options, runtime_env={"env_vars": variables})(_train_when_free)
         pending = {remote.remote(job_to_json(job)): job for job in jobs}
         while pending:
             (task,), _ = ray.wait(list(pending), num_returns=1)
@@ -187,14 +181,14 @@ def train_on_ray(
 
 
 def main() -> None:
-    """Train one run, which the first line of standard input describes. `train_in_process` starts this program.
+    """Train a run, which the first line of standard input describes. `train_in_process` starts this program.
 
-    Errors go to standard output, all other output to the log. The program ends when its parent ends, which closes standard input.
+    The error goes to standard output, all other output to the log. The program ends when its parent ends, which closes standard input.
     """
-    # Before training begins, there is nothing to save.
+    # Until training begins, there is nothing to save.
     signal.signal(signal.SIGINT, lambda number, frame: os._exit(130))
     # A path may have bytes that are not UTF-8.
-    parent = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", errors="backslashreplace")
+    to_parent = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", errors="backslashreplace")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     line = sys.stdin.readline()
     if not line:  # it was stopped already
@@ -204,7 +198,7 @@ def main() -> None:
     if request["cores"]:
         os.sched_setaffinity(0, request["cores"])
     if (error := _train_when_free(request["job"])) is not None:
-        for stream in (sys.stderr, parent):  # if one fails (a full disk, a dead parent), the other may work
+        for stream in (sys.stderr, to_parent):  # if one fails (a full disk, a dead parent), the other may work
             with contextlib.suppress(OSError):
                 stream.write(f"{error}\n")
                 stream.flush()
@@ -212,7 +206,7 @@ def main() -> None:
 
 
 def _interrupt_at_end_of_input() -> None:
-    """Save and stop, as after Ctrl-C, when the parent has ended."""
+    """Interrupt the main thread, as Ctrl-C does, when the parent has ended."""
     while os.read(0, 1):  # not through Python's buffer, whose lock would still be held at exit
         pass
     _thread.interrupt_main()

@@ -15,10 +15,9 @@ from lare_rl.util.sanitize import one_line
 __all__ = ["Resources", "Slot", "assign_accelerators", "assign_cores", "assign_slots", "last_line"]
 
 VISIBLE_ACCELERATORS = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES")
-"""The variables by which a process sees only some accelerators, by vendor."""
+"""The variables that choose the accelerators which a process sees, one for each vendor."""
 PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"
-"""Unless this is false, a process takes most of the memory of its accelerators when it starts, also if others use them."""
-
+"""Unless this is false, a process takes most of its accelerators' memory when it starts, even if they are shared."""
 COUNT_ACCELERATORS = "import jax; print(0 if jax.default_backend() == 'cpu' else jax.local_device_count())"
 
 
@@ -29,7 +28,7 @@ def _check_accelerators(accelerators: float) -> float:
 
 
 class Resources(CheckedModel):
-    """The part of the machine that runs use."""
+    """The cores and accelerators that runs use."""
 
     processes: Count = 1
     """Runs at a time."""
@@ -41,7 +40,7 @@ class Resources(CheckedModel):
 
 
 class Slot(NamedTuple):
-    """What a process uses of this machine."""
+    """The cores and accelerators of a process."""
 
     cores: list[int]
     """Empty if the system cannot tell which cores are usable."""
@@ -91,8 +90,8 @@ def assign_accelerators(
     """
     share = n_accelerators / processes if accelerators is None else accelerators
     n_processes_per_accelerator = int(1 / share) if 0 < share < 1 else 1
-    capacity = n_accelerators * n_processes_per_accelerator // max(1, int(share))
-    if accelerators and processes > capacity:
+    max_processes = n_accelerators * n_processes_per_accelerator // max(1, int(share))
+    if accelerators and processes > max_processes:
         raise LareError(
             f"{processes} processes with {accelerators:g} accelerators each need more than the {n_accelerators} accelerators that "
             "are usable here: lower processes or accelerators"
@@ -105,16 +104,13 @@ def assign_accelerators(
 def _accelerator_variables(
     process: int, share: float, n_accelerators: int, variables: Mapping[str, str]
 ) -> dict[str, str]:
-    count = int(share)
-    indices = (
-        range(process * count, (process + 1) * count) if share >= 1 else [process % n_accelerators] if share else []
-    )
+    first = process * int(share)
+    indices = [process % n_accelerators] if 0 < share < 1 else range(first, first + int(share))
     chosen = {}
     for name in VISIBLE_ACCELERATORS:
         visible = variables[name].split(",") if variables.get(name) else list(map(str, range(n_accelerators)))
-        if len(visible) < n_accelerators:  # it chooses accelerators of another vendor
-            continue
-        chosen[name] = ",".join(visible[i] for i in indices)
+        if len(visible) >= n_accelerators:  # else it chooses accelerators of another vendor
+            chosen[name] = ",".join(visible[index] for index in indices)
     if 0 < share < 1 and PREALLOCATE not in variables:
         chosen[PREALLOCATE] = "false"
     return chosen

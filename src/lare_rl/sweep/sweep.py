@@ -1,7 +1,7 @@
 """Sweeps: runs of tasks x methods x algorithms x draws from one file. All seeds of a run are trained in one process.
 
-Finished runs are skipped, unfinished runs continue from their checkpoints. So the same command continues a sweep that was killed,
-and extends a sweep whose file lists more runs than before.
+Finished runs are skipped, and unfinished runs continue from their checkpoints. So the same command continues a sweep that was killed,
+and extends a sweep whose file lists further runs.
 """
 
 import contextlib
@@ -26,22 +26,22 @@ from lare_rl.util.safe_io import read_table
 
 __all__ = ["read_sweep", "run_sweep"]
 
-Texts = Annotated[tuple[str, ...], Field(min_length=1)]
+Names = Annotated[tuple[str, ...], Field(min_length=1)]
 Draws = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
 
 class Sweep(Resources):
-    """The contents of the file. Paths are relative to it."""
+    """The contents of a sweep's file. Paths are relative to the file."""
 
-    tasks: Texts
+    tasks: Names
     """Shipped names, or paths of task files."""
-    methods: Texts
+    methods: Names
     algorithms: tuple[str, ...] = ()
-    """The default is each task's own."""
+    """By default, the algorithm of each task."""
     draws: Draws = (0,)
-    """Draws of the recorded replies, which the latent functions come from. Methods without a latent function are trained once."""
+    """Draws of the latent functions from the recorded replies. Methods without a latent function are trained once."""
     functions: dict[str, tuple[Path, ...]] = Field(default_factory=dict)
-    """Files of latent functions by the name of their task, one for each team. The default is the recorded replies."""
+    """Files of latent functions by the name of their task, one for each team. By default, recorded replies are used."""
     settings: dict[str, Any] = Field(default_factory=dict)
     """Other settings of `lare-rl train`, such as steps and seeds."""
     out: Path | None = None
@@ -49,7 +49,7 @@ class Sweep(Resources):
 
     @model_validator(mode="before")
     @classmethod
-    def _keys_are_in_their_tables(cls, values: Any) -> Any:
+    def _check_tables(cls, values: Any) -> Any:
         if not isinstance(values, Mapping):
             return values
         settings = values["settings"] if isinstance(values.get("settings"), Mapping) else {}

@@ -13,16 +13,10 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from filelock import FileLock
 from platformdirs import user_cache_path
 
 __all__ = ["cache_variables", "enable_cache"]
-
-_SETTINGS = {
-    "jax_compilation_cache_max_size": 2**30,  # bytes; JAX removes the programs that were not read for the longest time
-    "jax_persistent_cache_min_compile_time_secs": 0.1,  # programs that compile faster are not saved
-}
-"""JAX's settings of the cache. The environment variables have the same names in capitals."""
 
 _LOCK_TIMEOUT_S = 5
 
@@ -35,10 +29,9 @@ def cache_variables(environment: Mapping[str, str]) -> dict[str, str]:
 
     The result is empty if the user has turned the cache off or has chosen one for JAX, or if no cache can be written.
     """
-    if "JAX_COMPILATION_CACHE_DIR" in environment or (directory := _cache_directory(environment)) is None:
+    if "JAX_COMPILATION_CACHE_DIR" in environment:
         return {}
-    settings = {"jax_compilation_cache_dir": directory, **_SETTINGS}
-    return {name.upper(): str(value) for name, value in settings.items()}
+    return {name.upper(): str(value) for name, value in _cache_settings(environment).items()}
 
 
 def enable_cache() -> None:
@@ -46,30 +39,40 @@ def enable_cache() -> None:
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
-    chosen = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue] - JAX makes it at run time
-    if chosen is not None or (directory := _cache_directory(os.environ)) is None:
+    if jax.config.jax_compilation_cache_dir is not None:  # pyright: ignore[reportAttributeAccessIssue] - JAX makes it at run time
         return
-    for name, value in {"jax_compilation_cache_dir": str(directory), **_SETTINGS}.items():
+    for name, value in _cache_settings(os.environ).items():
         jax.config.update(name, value)
     compilation_cache.reset_cache()  # JAX asks once whether there is a cache, at its first compilation
 
 
-def _cache_directory(environment: Mapping[str, str]) -> Path | None:
-    """Return the cache directory for this kind of processor, created and repaired, or None if the cache cannot be used."""
-    setting = environment.get("LARE_CACHE", "")
+def _cache_settings(environment: Mapping[str, str]) -> dict[str, str | float]:
+    """Return JAX's settings for a cache for this kind of processor. They are empty if no cache can be used.
+
+    The directory is created and repaired. JAX's environment variables have the names of the settings in capitals.
+    """
+    setting = environment.get("LARE_CACHE", "").strip()
     if setting == "off":
-        return None
+        return {}
     directory = (Path(setting) if setting else user_cache_path("lare")) / f"compiled-{_processor_hash()}"
     try:
         directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         _remove_incomplete_programs(directory)
-    except (OSError, Timeout):
-        return None
-    return directory if os.access(directory, os.W_OK) else None
+    except OSError:
+        return {}
+    if not os.access(directory, os.W_OK):
+        return {}
+    return {
+        "jax_compilation_cache_dir": str(directory),
+        # In bytes. JAX removes the programs that were not read for the longest time.
+        "jax_compilation_cache_max_size": 2**30,
+        # Programs that compile faster are not saved.
+        "jax_persistent_cache_min_compile_time_secs": 0.1,
+    }
 
 
 def _remove_incomplete_programs(directory: Path) -> None:
-    """Remove what a killed process has left incomplete; JAX would fail to read it every time."""
+    """Remove programs of which a killed process has written only one file. JAX would fail to read them every time."""
     with FileLock(directory / ".lockfile", timeout=_LOCK_TIMEOUT_S):  # JAX's own lock, so that no process is writing
         programs, times = (
             {file.name.removesuffix(suffix) for file in directory.glob(f"*{suffix}")}

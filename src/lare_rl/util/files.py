@@ -15,12 +15,21 @@ from uuid import uuid4
 from lare_rl.errors import LareError
 
 __all__ = [
-    "check_new_path", "check_writable", "find_free_path", "make_directory", "new_directory", "replace_npz", "write_atomically",
-    "write_bytes", "write_npz",
+    "check_new_path", "check_writable", "find_free_path", "make_directory", "new_directory", "remove_partial_files", "replace_npz",
+    "report_write_error", "write_atomically", "write_bytes", "write_npz",
 ]  # fmt: skip
 
 RETRY_S = 0.01, 0.03, 0.1, 0.3, 1.0
-"""Windows does not replace a file that another process reads just now. Pauses between the attempts (s)."""
+"""Pauses between attempts to replace a file (s): Windows refuses while another process reads it."""
+
+
+@contextlib.contextmanager
+def report_write_error(path: Path, hint: str = "") -> Iterator[None]:
+    """Raise a `LareError` that names `path`, in place of an `OSError`. `hint` ends its message."""
+    try:
+        yield
+    except OSError as error:
+        raise LareError(f"{path} cannot be written: {error.strerror or error}{hint}") from error
 
 
 def check_new_path(path: Path, option: str = "file", overwrite: bool | None = None) -> None:
@@ -28,10 +37,10 @@ def check_new_path(path: Path, option: str = "file", overwrite: bool | None = No
 
     Args:
         path: the file.
-        option: what names it, such as an option of the command line.
+        option: the word for it in messages, such as an option of the command line.
         overwrite: whether it may exist. None if the caller has no such option.
     """
-    try:
+    with report_write_error(path):
         if path.is_dir():
             raise LareError(f"{path} is not the name of a file; choose another {option}")
         if path.exists() and not overwrite:
@@ -40,30 +49,25 @@ def check_new_path(path: Path, option: str = "file", overwrite: bool | None = No
         if not path.parent.is_dir():
             raise LareError(f"{path} cannot be written: there is no directory {path.parent}; choose another {option}")
         check_writable(path)
-    except OSError as error:
-        raise LareError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def check_writable(path: Path) -> None:
     """Raise `LareError` if nothing can be written beside `path`."""
-    try:
-        tempfile.TemporaryFile(dir=path.parent).close()  # os.access says nothing to root about /proc
-    except OSError as error:
-        raise LareError(f"{path} cannot be written: {error.strerror}") from error
+    with report_write_error(path):
+        tempfile.TemporaryFile(dir=path.parent).close()  # for root, os.access calls even /proc writable
 
 
 def find_free_path(directory: Path, name: str, suffix: str = "") -> Path:
-    """Return DIRECTORY/NAME.SUFFIX, with a number appended to the name if that exists."""
-    paths = (directory / f"{name}{f'-{number}' if number > 1 else ''}{suffix}" for number in itertools.count(1))
+    """Return DIRECTORY/NAMESUFFIX or, if that exists, DIRECTORY/NAME-2SUFFIX, and so on."""
+    endings = itertools.chain([suffix], (f"-{number}{suffix}" for number in itertools.count(2)))
+    paths = (directory / f"{name}{ending}" for ending in endings)
     return next(path for path in paths if not path.exists())
 
 
 def make_directory(directory: Path) -> None:
     """Make a directory and its parents, if they do not exist. Raises `LareError` if that is not possible."""
-    try:
+    with report_write_error(directory):
         directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LareError(f"{directory} cannot be written: {error.strerror or error}") from error
 
 
 @contextlib.contextmanager
@@ -74,11 +78,10 @@ def new_directory(directory: Path) -> Iterator[Path]:
     """
     new = directory.with_name(f".{directory.name}.{uuid4().hex}.new")
     try:
-        new.mkdir(parents=True)
-        yield new
-        new.rename(directory)
-    except OSError as error:
-        raise LareError(f"{directory} cannot be written: {error.strerror or error}") from error
+        with report_write_error(directory):
+            new.mkdir(parents=True)
+            yield new
+            new.rename(directory)
     finally:
         shutil.rmtree(new, ignore_errors=True)
 
@@ -102,6 +105,12 @@ def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
         new.unlink(missing_ok=True)
 
 
+def remove_partial_files(path: Path) -> None:
+    """Remove what killed processes have left of writing `path`, whose name may have wildcards."""
+    for partial_file in path.parent.glob(f"{path.name}.*.new"):
+        partial_file.unlink(missing_ok=True)
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """Write or replace a file as a whole. Raises `LareError` if it cannot be written."""
     write_atomically(path, lambda file: file.write(content))
@@ -113,10 +122,7 @@ def replace_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 
 
 def write_npz(file: IO[bytes], arrays: Mapping[str, Any]) -> None:
-    """Write arrays of any name.
-
-    `numpy.savez` refuses names that are also its own arguments, such as `file`. Which names these are depends on its version.
-    """
+    """Write arrays of any name. `numpy.savez` refuses the names of its own arguments, such as `file`."""
     import numpy as np  # here, because the command line imports this module before it shows a message
 
     with zipfile.ZipFile(file, "w", allowZip64=True) as archive:

@@ -1,6 +1,6 @@
-"""A finding is a message code with its values. Each package has one dictionary of message templates.
+"""A finding is a message code with its values. A catalogue, of which each package has one, maps codes to templates.
 
-A catalogue is a dictionary from code to template. A template is a text of `str.format` with commands in backticks:
+A template is a text of `str.format` with commands in backticks:
 
     MESSAGES = {"rising": "The return was still rising at step {step:,} ({return_:number}). Continue with `{command}`."}
     render(Finding("rising", {"step": 5000, "return_": 12.3, "command": "lare-rl train"}), MESSAGES)
@@ -20,7 +20,6 @@ from typing import Any, Literal, SupportsFloat
 __all__ = ["Finding", "format_for_reader", "format_number", "render"]
 
 Catalogue = Mapping[str, str]
-"""The message templates of a package, by code."""
 
 _CODE = re.compile(r"`([^`]*)`")
 _MARKDOWN_SPECIAL = re.compile(r"([\\*_|<>\[\]])")
@@ -28,7 +27,7 @@ _MARKDOWN_SPECIAL = re.compile(r"([\\*_|<>\[\]])")
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of a rule. Findings are hashable if their values are."""
+    """A message code with its values. Findings are hashable if their values are."""
 
     code: str
     """The key of its template in the catalogue."""
@@ -41,8 +40,7 @@ class Finding:
 def render(finding: Finding, catalogue: Catalogue, style: Literal["text", "html", "markdown"] = "text") -> str:
     """Return a finding's sentence for the terminal (`text`), a page (`html`, escaped), or a Markdown file (`markdown`, escaped).
 
-    Raises:
-        KeyError: the catalogue lacks the code, or the finding lacks a value of its template.
+    Raises `KeyError` if the catalogue lacks the code, or the finding a value of its template.
     """
     text = _Formatter(catalogue).vformat(catalogue[finding.code], (), finding.values)
     if style == "html":
@@ -89,13 +87,13 @@ def format_for_reader(value: Any, spec: str = "") -> str:
 
 
 def format_number(value: SupportsFloat) -> str:
-    """Write a number as all pages do."""
+    """Write a number by the spec `number`."""
     return format_for_reader(float(value), "number")
 
 
 @dataclass
 class _Formatter(string.Formatter):
-    """Formats values, and findings among them by the same catalogue."""
+    """Formats values by `format_for_reader`, and findings by their templates."""
 
     catalogue: Catalogue
 

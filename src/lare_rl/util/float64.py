@@ -13,7 +13,7 @@ __all__ = ["float64", "load_linear_algebra", "one_blas_thread"]
 
 @contextlib.contextmanager
 def float64() -> Iterator[None]:
-    """Let JAX calculate or trace in float64, and linear algebra use one thread. Wait for results before the block ends."""
+    """Let JAX calculate and trace in float64, and linear algebra use one thread. Wait for results before the block ends."""
     with jax.enable_x64(True), one_blas_thread():
         yield
 
@@ -21,14 +21,14 @@ def float64() -> Iterator[None]:
 def one_blas_thread() -> contextlib.AbstractContextManager[Any]:
     """Let linear algebra use one thread. Wait for results before the block ends.
 
-    The matrices of a fit are small. With several threads, the libraries of linear algebra wait actively until each thread has
-    run. On a machine whose cores have other work, a fit then takes a hundred times as long.
+    The matrices of a fit are small. Several threads would wait for each other in busy loops: on cores that have other work, a fit
+    then takes a hundred times as long.
     """
     return _linear_algebra_libraries().limit(limits=1, user_api="blas")
 
 
 def load_linear_algebra() -> None:
-    """Import SciPy's linear algebra before threads compile. JAX imports it when it compiles, and two threads that do so may fail."""
+    """Import SciPy's linear algebra before threads compile. JAX imports it when it compiles, which may fail in two threads at a time."""
     import scipy.linalg  # noqa: F401 - JAX calls the LAPACK that SciPy loads
 
 

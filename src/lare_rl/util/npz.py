@@ -18,20 +18,20 @@ DAMAGED_FILE_ERRORS = (
     *(OSError, ValueError, KeyError, EOFError, NotImplementedError, RecursionError, zipfile.BadZipFile, zlib.error),
     *(tokenize.TokenError, TypeError, IndexError, AttributeError, OverflowError, MemoryError, SyntaxError),
 )
-"""Errors that may be raised by reading a file that is damaged, or holds something else."""
+"""Errors from reading a file that is damaged, or holds something else."""
 
 MAX_REASON = 200
-"""Letters of a message that are shown: some errors repeat the file."""
+"""Letters that are quoted of an error's message, because some messages repeat the file."""
 _ENCRYPTED = 1  # a flag of an entry
 
 
 @contextlib.contextmanager
 def open_npz(path: Path, max_bytes: int | None = None) -> Iterator[np.lib.npyio.NpzFile]:
-    """Open the arrays of a file. A damaged file is closed too, unlike by `numpy.load` alone.
+    """Open the arrays of a file, and close it at the end, even if it is damaged.
 
     Compressed arrays are only read with `max_bytes`, the largest size of all arrays in memory.
 
-    Raises `ValueError` if they are compressed or too large, or one of the other `DAMAGED_FILE_ERRORS`.
+    Raises `ValueError` if arrays are compressed or too large, or another of the `DAMAGED_FILE_ERRORS`.
     """
     with path.open("rb") as file:
         if not zipfile.is_zipfile(file):

@@ -17,6 +17,7 @@ from importlib.metadata import entry_points
 from typing import Generic, TypeVar
 
 from lare_rl.errors import LareError, find_named
+from lare_rl.util.sanitize import one_line
 from lare_rl.util.variables import read_variable
 
 __all__ = ["Registry", "load_plugins"]
@@ -29,45 +30,43 @@ _NAME = re.compile(r"[\w.-]+")
 @cache
 def load_plugins() -> None:
     """Import all plugins. Later calls do nothing. Raises `LareError` if a plugin cannot be imported."""
-    plugins = {}
     for entry in entry_points(group="lare_rl.plugins"):
         package = entry.dist.name if entry.dist else "its package"
-        source = f" of the package {package} (entry point {entry.name} = {entry.value})"
-        plugins[entry.name] = entry.value.partition(":")[0].strip(), source, f"Update or uninstall {package}."
-    for name in filter(None, map(str.strip, read_variable("LARE_PLUGINS").split(","))):
-        without = f", and write {name[:-3]}" if name.endswith(".py") else ""
-        plugins[name] = name, "", f"Correct LARE_PLUGINS, or PYTHONPATH, where Python looks for it{without}."
-    for plugin, (module, source, advice) in plugins.items():
-        try:
-            import_module(module)
-        except Exception as error:  # a plugin's code can raise anything
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            if not isinstance(error, ImportError):
-                advice = "lare-rl --debug shows the line."
-            raise LareError(f"the plugin {plugin!r}{source} cannot be imported: {reason}. {advice}") from error
+        plugin = f"{entry.name!r} of the package {package} (entry point {entry.name} = {entry.value})"
+        _import_plugin(entry.value.partition(":")[0].strip(), plugin, f"Update or uninstall {package}.")
+    for module in filter(None, map(str.strip, read_variable("LARE_PLUGINS").split(","))):
+        without = f", and write {module[:-3]}" if module.endswith(".py") else ""
+        advice = f"Correct LARE_PLUGINS, or PYTHONPATH, where Python looks for it{without}."
+        _import_plugin(module, repr(module), advice)
+
+
+def _import_plugin(module: str, plugin: str, advice: str) -> None:
+    """Import a plugin. `plugin` describes it in the error, and `advice` says what to do if its module is missing."""
+    try:
+        import_module(module)
+    except Exception as error:  # a plugin's code can raise anything
+        reason = one_line(f"{type(error).__name__}: {error}")
+        if not isinstance(error, ImportError):
+            advice = "lare-rl --debug shows the line."
+        raise LareError(f"the plugin {plugin} cannot be imported: {reason}. {advice}") from error
 
 
 class Registry(Mapping[str, T], Generic[T]):
     """Values by name, which plugins can add to: `METHODS = Registry[Method]("method")`."""
 
     def __init__(self, kind: str, kinds: str | None = None):
-        """Create an empty registry.
-
-        Args:
-            kind: the noun for its values in messages, such as "method".
-            kinds: the plural, if it is not the noun with an s.
-        """
+        """Create an empty registry. `kind` is the noun for a value in messages, and `kinds` its plural, by default with an s."""
         self._kind, self._kinds = kind, kinds or f"{kind}s"
         self._values: dict[str, T] = {}
 
     def register(self, name: str, value: T) -> None:
         """Add a value.
 
-        Raises `LareError` if the name has other characters than letters, digits, `-`, `_` and `.`, or if another value has it. Names
-        cannot be reused, because compiled programs are cached by name.
+        Raises `LareError` if the name has other characters than letters, digits, `-`, `_` and `.`, or if another value has it:
+        compiled programs are cached by name.
         """
         if not _NAME.fullmatch(str(name)):
-            raise LareError(f"the name of a {self._kind} has letters, digits, - and _ only, unlike {name!r}")
+            raise LareError(f"the name of a {self._kind} has letters, digits, -, _ and . only, unlike {name!r}")
         if self._values.setdefault(name, value) != value:
             raise LareError(
                 f"there is another {self._kind} {name!r}: choose another name; if you ran the same file or cell twice, restart Python, "
@@ -75,7 +74,7 @@ class Registry(Mapping[str, T], Generic[T]):
             )
 
     def find(self, name: str) -> T:
-        """Return the value of this name. Raises `LareError` if no value has this name. The message lists all names."""
+        """Return the value of a name. Raises `LareError` if no value has it: the message lists all names."""
         if name not in self._values:
             load_plugins()
         try:

@@ -9,7 +9,7 @@ __all__ = ["n_usable_cores", "own_session", "try_lock", "usable_cores"]
 
 
 def own_session() -> dict[str, Any]:
-    """Return the options of `subprocess.Popen` by which Ctrl-C in the terminal reaches only this process, not the new one."""
+    """Return options of `subprocess.Popen` that keep Ctrl-C in the terminal from the new process."""
     if sys.platform == "win32":
         return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
     return {"start_new_session": True}
@@ -26,7 +26,7 @@ def n_usable_cores() -> int:
 
 
 def try_lock(file: IO[bytes]) -> bool:
-    """Lock a file until it is closed. Return False if it is locked already, and True if the file system has no locks."""
+    """Lock a file until it is closed. Return False if another process has locked it, and True if the file system has no locks."""
     try:
         if sys.platform == "win32":
             import msvcrt
@@ -38,6 +38,6 @@ def try_lock(file: IO[bytes]) -> bool:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except (BlockingIOError, PermissionError):
         return False
-    except (ImportError, OSError):  # some network file systems have no locks
-        return True
+    except (ImportError, OSError):
+        pass  # some network file systems have no locks
     return True

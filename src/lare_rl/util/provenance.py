@@ -13,8 +13,7 @@ __all__ = ["code_version"]
 def code_version(directory: Path = Path(__file__).parents[1]) -> str:
     """Return the version of the package; in a checkout also its last commit, and whether the code was changed since.
 
-    Only commits that touch `directory` count. A directory such as a virtual environment may lie within another repository, whose
-    commits say nothing about it.
+    Only commits that touch `directory` count: a virtual environment may lie within another repository.
     """
     commit = _git(directory, "log", "-1", "--format=%h", "--abbrev=10", "--", ".")
     if not commit:

@@ -12,10 +12,10 @@ _RENAMED_KEYS = {
     "judged_from": "credit_scope",
     "judges": "scored_observation",
 }
-"""From old to new keys of tasks, settings, sweeps and assigners, and options of the command line."""
+"""From old to new keys of tasks, settings, sweeps and assigners, and to new options of the command line."""
 
 _FREE_TABLES = {"arguments", "functions"}
-"""Tables whose keys are not LaRe's: an environment's keyword arguments, and names of tasks."""
+"""Tables with other keys, which stay: an environment's keyword arguments, and names of tasks."""
 
 _RENAMED_METRICS = {"likeliest_return": "deterministic_return"}
 """From old to new metrics, after the slash."""
@@ -61,9 +61,9 @@ _RENAMED_FIELDS = {
 """From old to new fields of states."""
 
 _DECODER = r"(?:\.decoders\[\d+\]|^\[0\])"
-"""The pattern of a decoder's path in a checkpoint, or in an assigner."""
+"""Matches the path of a decoder in a checkpoint, or in an assigner."""
 _NETWORK = rf"({_DECODER}\.(?:network|.*\.(?:mu|nu)))"
-"""Its network, or one of Adam's moments, which have the same fields."""
+"""Matches the path of its network, or of one of Adam's moments, which have the same fields."""
 _RENAMED_PATHS = {
     r"\.agent\.decoder\b": ".agent.head",
     r"^\.algorithm\.qmix\b": ".algorithm.networks",
@@ -90,7 +90,7 @@ _RENAMED_PATHS = {
 def rename_keys(values: Any) -> Any:
     """Return a table, with the tables in it, under the present names of keys.
 
-    If a table has both names of a key, both stay, and the old one is refused later as unknown.
+    If a table has both names of a key, both stay, and the reader of the table refuses the old one as unknown.
     """
     if isinstance(values, list):
         return [rename_keys(value) for value in values]
@@ -108,8 +108,12 @@ def rename_assigner(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def rename_metrics(line: Mapping[str, Any]) -> dict[str, Any]:
     """Return a line of metrics.jsonl under the present names of metrics."""
-    split = {name: name.rpartition("/") for name in line}
-    return {head + slash + _RENAMED_METRICS.get(tail, tail): line[name] for name, (head, slash, tail) in split.items()}
+
+    def rename(name: str) -> str:
+        group, slash, metric = name.rpartition("/")
+        return f"{group}{slash}{_RENAMED_METRICS.get(metric, metric)}"
+
+    return {rename(name): value for name, value in line.items()}
 
 
 def rename_options(arguments: Sequence[str]) -> list[str]:
@@ -118,14 +122,16 @@ def rename_options(arguments: Sequence[str]) -> list[str]:
     def rename(argument: str) -> str:
         option, equals, value = argument.partition("=")
         table, dot, name = option.removeprefix("--").rpartition(".")
-        new = _RENAMED_KEYS.get(name.replace("-", "_"))
-        return f"--{table}{dot}{new.replace('_', '-')}{equals}{value}" if new and option.startswith("--") else argument
+        new_name = _RENAMED_KEYS.get(name.replace("-", "_"))
+        if new_name is None or not option.startswith("--"):
+            return argument
+        return f"--{table}{dot}{new_name.replace('_', '-')}{equals}{value}"
 
     return list(map(rename, arguments))
 
 
 def rename_fields(name: str) -> str:
-    """Return the present name of an array by the path of its fields: `.credit[0].average` becomes `.decoders[0].is_average`."""
+    """Return the present path of an array: `.credit[0].average` becomes `.decoders[0].is_average`."""
     name = re.sub(r"(?<=\.)\w+", lambda match: _RENAMED_FIELDS.get(match.group(), match.group()), name)
     for pattern, new in _RENAMED_PATHS.items():
         name = re.sub(pattern, new, name)

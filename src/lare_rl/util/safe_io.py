@@ -1,6 +1,6 @@
 """Reading of untrusted files: texts of a bounded size, JSON and TOML of a bounded depth.
 
-Files that LaRe wrote are read by these functions too: they may be damaged, or come from another person.
+These functions read the files of LaRe too, which may be damaged, or come from another person.
 """
 
 import json
@@ -25,23 +25,19 @@ __all__ = [
 
 MAX_DEPTH = 64
 """The largest depth of objects within objects."""
-
 MAX_TEXT_BYTES = 64 << 20
 """The largest size of a file of texts, such as a recording of a hundred long replies."""
-
 MAX_SETTINGS_BYTES = 1 << 20
 """The largest size of a file that is written by hand."""
-
 _MAX_DIGITS = 1000
-"""The most digits of a whole number of JSON. Python's own limit is 4300, and its message is for programmers."""
+"""The most digits of a whole number in JSON. Python's limit is 4300, and its message is for programmers."""
+_TOO_DEEP = f"it is nested more than {MAX_DEPTH} deep"
 
 _TOML_TEXT = re.compile(r'''"""(?:[^\\]|\\[\s\S])*?"""|\'\'\'[\s\S]*?\'\'\'|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+'|#[^\n]*+''')
 """A string or a comment of TOML."""
 
 _DEEP_NAME = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MAX_DEPTH}}}")
-"""A name of deeply nested tables, for which the parser takes quadratic time. Its strings must have been replaced by words."""
-
-_TOO_DEEP = f"it is nested more than {MAX_DEPTH} deep"
+"""A dotted name (`a.b.c`) of more than `MAX_DEPTH` parts without quotes. TOML's parser takes quadratic time for such a name."""
 
 
 def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
@@ -57,19 +53,15 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         if len(content) > max_bytes:
             raise LareError(f"{path} is larger than {max_bytes >> 20} MB")
         return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = (isinstance(error, OSError) and error.strerror) or error
+    except (OSError, ValueError) as error:  # a path may hold a null character
+        reason = getattr(error, "strerror", None) or error
         raise LareError(f"{path} cannot be read: {reason}") from error
 
 
 def read_json(text: str | bytes, strict: bool = True) -> Any:
-    """Parse a JSON text.
+    """Parse a JSON text, whose strings may contain line breaks if not `strict`.
 
-    Args:
-        strict: if false, strings may contain line breaks.
-
-    Raises:
-        ValueError: the text is not JSON, or is nested too deep.
+    Raises `ValueError` if the text is not JSON, or is nested too deep.
     """
     try:
         return check_depth(json.loads(text, strict=strict, parse_int=parse_integer))
@@ -78,7 +70,7 @@ def read_json(text: str | bytes, strict: bool = True) -> Any:
 
 
 def read_json_object(text: str | bytes) -> dict[str, Any]:
-    """Parse a JSON object. Raises `ValueError` like `read_json`, and for another value."""
+    """Parse a JSON object. Raises `ValueError` as `read_json` does, and if the text is no object."""
     value = read_json(text)
     if not isinstance(value, dict):
         raise ValueError("it is not an object")
@@ -111,7 +103,7 @@ def read_table(path: Path, max_bytes: int = MAX_SETTINGS_BYTES) -> dict[str, Any
 
 
 def check_depth(value: Any) -> Any:
-    """Return a value that is not nested too deep for recursive functions. Raises `ValueError` if it is nested too deep."""
+    """Return a value. Raises `ValueError` if it is nested too deep for recursive functions."""
     level = [value]
     for _ in range(MAX_DEPTH + 1):
         containers = [x.values() if isinstance(x, dict) else x for x in level if isinstance(x, dict | list)]

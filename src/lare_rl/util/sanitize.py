@@ -5,7 +5,7 @@ import unicodedata
 
 __all__ = ["first_invisible", "one_line", "replace_surrogates", "sanitize"]
 
-# Letters and marks by their category, but invisible (Default_Ignorable_Code_Point, and the empty Braille pattern).
+# Invisible letters and marks (Default_Ignorable_Code_Point), and the empty Braille pattern.
 _FILLERS = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2065\u2800\u3164\ufe00-\ufe0f\uffa0\U0001bca0-\U0001bca3\U000e0000-\U000e0fff]"
 )
@@ -14,7 +14,7 @@ _INVISIBLE_CATEGORIES = frozenset({"Cc", "Cf", "Co", "Cs", "Cn", "Zl", "Zp"})
 
 
 def sanitize(text: str) -> str:
-    """Replace control and invisible characters by `?`, because some printed texts come from strangers."""
+    """Replace control and invisible characters by `?`."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(letter if _is_visible(letter) else "?" for letter in text)
@@ -26,7 +26,7 @@ def one_line(text: object) -> str:
 
 
 def replace_surrogates(text: str) -> str:
-    """Replace each half of a surrogate pair by `?`: JSON can express it, but no file and no request can hold it."""
+    """Replace each half of a surrogate pair by `?`. JSON can express a half, but UTF-8 cannot."""
     return text.encode(errors="replace").decode()
 
 
@@ -38,6 +38,5 @@ def first_invisible(text: str) -> int | None:
 
 
 def _is_visible(letter: str) -> bool:
-    if letter in "\n\t":
-        return True
-    return unicodedata.category(letter) not in _INVISIBLE_CATEGORIES and not _FILLERS.match(letter)
+    is_invisible = unicodedata.category(letter) in _INVISIBLE_CATEGORIES or _FILLERS.match(letter)
+    return letter in "\n\t" or not is_invisible

@@ -31,7 +31,7 @@ CLEAR_ERRORS = 2
 FLOAT32_NOISE = 1e-6
 """In float32, a constant may vary by this fraction of its size."""
 CONSTANT = 1e-10
-"""Values are taken as equal if the sum of their squared deviations is below this fraction of the sum of their squares."""
+"""Values count as equal if the sum of their squared deviations is below this fraction of the sum of their squares."""
 
 
 class Band(NamedTuple):
@@ -60,22 +60,20 @@ def standard_error(values: Float[np.ndarray, " values"]) -> float:
 
 
 def grouped_standard_error(group_means: Float[np.ndarray, " groups"], error_within: float) -> float:
-    """Return the standard error of the mean of groups: from group to group, or within groups, whichever is larger.
+    """Return the larger of two standard errors of the mean of grouped values: between the groups, and `error_within` them.
 
-    Args:
-        group_means: the mean of each group, such as each seed's mean over its episodes.
-        error_within: the standard error of the mean of all values, by their deviations from the means of their groups.
+    The groups are, for example, seeds, and the values the returns of their episodes.
     """
     return max(error_within, standard_error(group_means))
 
 
 def episode_error(variances: Float[np.ndarray, " seeds"], n_episodes: int) -> float:
-    """Return the standard error of the mean over all episodes, from the unbiased variance of each seed's `n_episodes` episodes."""
+    """Return the standard error of the mean over all episodes, from the unbiased variance of each seed's episodes."""
     return math.sqrt(np.mean(variances) / (len(variances) * n_episodes))
 
 
 def round_shares(shares: Sequence[float], total: float = 1.0) -> list[float]:
-    """Round shares to whole percents that add up to `total`, by the largest remainder. `total` is a whole percent."""
+    """Round shares to whole percents that add up to `total`, itself a whole percent, by the largest remainder."""
     percents = 100 * np.asarray(shares, np.float64)
     rounded = np.floor(percents).astype(int)
     n_missing = round(100 * total) - int(rounded.sum())
@@ -84,7 +82,7 @@ def round_shares(shares: Sequence[float], total: float = 1.0) -> list[float]:
 
 
 def correlation(x: Float[np.ndarray, " values"], y: Float[np.ndarray, " values"]) -> float:
-    """Return Pearson's correlation, or NaN if one of the two never varies or has fewer than two values."""
+    """Return Pearson's correlation, or NaN for fewer than two values, or if one of the two never varies."""
     if len(x) < 2:
         return math.nan
     with np.errstate(invalid="ignore"):

@@ -2,7 +2,7 @@
 
 import os
 
-__all__ = ["VARIABLES", "VARIABLE_GROUPS", "read_variable"]
+__all__ = ["VARIABLE_GROUPS", "read_variable"]
 
 VARIABLE_GROUPS: dict[str, dict[str, str]] = {
     "LaRe": {
@@ -33,16 +33,12 @@ VARIABLE_GROUPS: dict[str, dict[str, str]] = {
 }
 """What each variable means, by subject."""
 
-VARIABLES = {name: meaning for group in VARIABLE_GROUPS.values() for name, meaning in group.items()}
-"""What each variable means."""
-
 
 def read_variable(name: str) -> str:
     """Return the value of an environment variable without surrounding spaces, or an empty text if it is not set.
 
-    Raises:
-        KeyError: the variable is not in `VARIABLES`.
+    Raises `KeyError` if the variable is not in `VARIABLE_GROUPS`.
     """
-    if name not in VARIABLES:
+    if not any(name in group for group in VARIABLE_GROUPS.values()):
         raise KeyError(name)
     return os.environ.get(name, "").strip()

@@ -13,10 +13,9 @@ if TYPE_CHECKING:
 __all__ = ["PPOSettings"]
 
 MIN_ROLLOUT_STEPS = 16
-"""The least number of steps of each environment between two updates, by default, before they are rounded to whole episodes. Advantages
-need some steps in a row."""
+"""The default rollout has at least this many steps of each environment, because advantages need some steps in a row."""
 ROLLOUT_STEPS = 2000
-"""The steps of all environments together between two updates, by default."""
+"""The steps of all environments together in the default rollout."""
 
 
 class PPOSettings(AlgorithmSettings):
@@ -33,7 +32,7 @@ class PPOSettings(AlgorithmSettings):
     epochs: Count = 10
     """Passes over the rollout in one update."""
     minibatch_size: Count = 64
-    """Samples per gradient step; each agent's step is one sample."""
+    """Samples per gradient step: steps of single agents."""
     clip: Annotated[float, Field(gt=0)] = 0.2
     """How far the probability ratio may move from 1."""
     value_clip: Annotated[float, Field(gt=0)] = 0.5
@@ -52,16 +51,13 @@ class PPOSettings(AlgorithmSettings):
     """Normalise observations by their running mean and standard deviation."""
 
 
-def _whole_episodes(env: "EnvSpec", n_steps: int) -> int:
-    """Round n_steps to whole episodes of maximum length; keep n_steps if that would give 0."""
-    return round(n_steps / env.max_steps) * env.max_steps or n_steps
-
-
 def _ppo_defaults(env: "EnvSpec", environments: int | None) -> dict[str, Any]:
     environments = environments or 1
+    n_steps = max(MIN_ROLLOUT_STEPS, ROLLOUT_STEPS // environments)
     return {
         "environments": environments,
-        "rollout_steps": _whole_episodes(env, max(MIN_ROLLOUT_STEPS, ROLLOUT_STEPS // environments)),
+        # Rounded to episodes of maximum length, unless that would give 0.
+        "rollout_steps": round(n_steps / env.max_steps) * env.max_steps or n_steps,
         "fit_updates": 500,
         "evaluate_iterations": 5,
     }

@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lare_rl.algorithms.batches import Action, Available, Observation, Value
+from lare_rl.algorithms.batches import Action, Available, Observation, PerStep
 from lare_rl.nn.networks import MLP
 
-__all__ = ["UNAVAILABLE_LOGIT", "StochasticPolicy"]
+__all__ = ["StochasticPolicy"]
 
 UNAVAILABLE_LOGIT = -1e9
 
@@ -16,7 +16,7 @@ UNAVAILABLE_LOGIT = -1e9
 class StochasticPolicy(eqx.Module):
     """A Gaussian whose standard deviation does not depend on the state or, if `log_std` is None, a categorical distribution.
 
-    A choice is a one-hot row, so that every action is a row of numbers. The caller normalises the observations.
+    The caller normalises the observations.
     """
 
     network: MLP
@@ -27,14 +27,14 @@ class StochasticPolicy(eqx.Module):
         logits = self.network(observation)
         return logits if available is None else jnp.where(available, logits, UNAVAILABLE_LOGIT)
 
-    def log_probability(self, observation: Observation, action: Action, available: Available = None) -> Value:
+    def log_probability(self, observation: Observation, action: Action, available: Available = None) -> PerStep:
         """Return log pi(a | s)."""
         if self.log_std is None:
             return jnp.sum(action * jax.nn.log_softmax(self.logits(observation, available)), axis=-1)
         z = (action - self.network(observation)) * jnp.exp(-self.log_std)
         return jnp.sum(-0.5 * z**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
 
-    def entropy(self, observation: Observation, available: Available = None) -> Value:
+    def entropy(self, observation: Observation, available: Available = None) -> PerStep:
         """Return the entropy, -E log pi(a | s)."""
         if self.log_std is None:
             log_pi = jax.nn.log_softmax(self.logits(observation, available))
@@ -43,15 +43,18 @@ class StochasticPolicy(eqx.Module):
         return jnp.broadcast_to(jnp.sum(entropy, axis=-1), observation.shape[:-1])
 
     def sample(self, observation: Observation, noise: Action, available: Available = None) -> Action:
-        """Return the action for this noise: standard normal or, for choices, Gumbel (the largest logit plus noise is chosen)."""
+        """Return the action for this noise: standard normal or, for choices, Gumbel."""
         if self.log_std is None:
-            logits = self.logits(observation, available)
-            return jax.nn.one_hot(jnp.argmax(logits + noise, axis=-1), logits.shape[-1])
+            return _choose(self.logits(observation, available) + noise)
         return self.network(observation) + jnp.exp(self.log_std) * noise
 
     def mode(self, observation: Observation, available: Available = None) -> Action:
-        """Return the likeliest action."""
+        """Return the most likely action."""
         if self.log_std is None:
-            logits = self.logits(observation, available)
-            return jax.nn.one_hot(jnp.argmax(logits, axis=-1), logits.shape[-1])
+            return _choose(self.logits(observation, available))
         return self.network(observation)
+
+
+def _choose(logits: Action) -> Action:
+    """Return the choice of the largest logit."""
+    return jax.nn.one_hot(jnp.argmax(logits, axis=-1), logits.shape[-1])

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Scalar
 
-from lare_rl.algorithms.batches import Action, Available, Metrics, Observation, Rollout, Value
+from lare_rl.algorithms.batches import Action, Available, Metrics, Observation, PerStep, Rollout
 from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.algorithms.ppo.policies import StochasticPolicy
 from lare_rl.nn.masks import masked_mean
@@ -45,12 +45,11 @@ class PPO(NamedTuple):
     return_rms: RunningMeanStd
     """Running statistics of the returns that the critic was fitted to."""
     observation_rms: RunningMeanStd | None
-    """Running statistics that normalise the networks' observations; None if these are not normalised. A rollout is added only
-    after the update on it: until then, the policy must see observations as it did when it acted."""
+    """Running statistics that normalise the networks' observations; None if these are not normalised."""
 
 
 class Actor(NamedTuple):
-    """What is needed to act."""
+    """The policy, and the statistics that normalise its observations."""
 
     policy: StochasticPolicy
     observation_rms: RunningMeanStd | None
@@ -65,7 +64,7 @@ class Batch(NamedTuple):
     """The log probability of the action under the policy that chose it."""
     advantage: Float[Array, " batch"]
     value: Float[Array, " batch"]
-    """The critic's output before the update, in the critic's units. The value loss clips new outputs to within `value_clip` of it."""
+    """The critic's standardised output before the update. The value loss clips new outputs to within `value_clip` of it."""
     target: Float[Array, " batch"]
     """The returns, standardised by statistics that include them."""
     available: Bool[Array, "batch action"] | None
@@ -73,7 +72,7 @@ class Batch(NamedTuple):
 
 
 def init(key: PRNGKeyArray, observation_size: int, action_size: int, discrete: bool, settings: PPOSettings) -> PPO:
-    """Return networks with orthogonal weights. The first policy hardly prefers any action, and the first values are near 0."""
+    """Return networks with orthogonal weights. The actor's last weights are small, so that no action is preferred at first."""
     actor_key, critic_key, *orthogonal_keys = jax.random.split(key, 4)
     actor = MLP(observation_size, settings.hidden, action_size, key=actor_key, activation=jnp.tanh)
     critic = MLP(observation_size, settings.hidden, 1, key=critic_key, activation=jnp.tanh)
@@ -104,7 +103,7 @@ def logits(actor: Actor, observation: Observation, available: Available) -> Acti
 
 
 def act(actor: Actor, observation: Observation, available: Available) -> Action:
-    """Return the likeliest action."""
+    """Return the most likely action."""
     return actor.policy.mode(normalise(observation, actor.observation_rms), available)
 
 
@@ -113,7 +112,7 @@ def explore(actor: Actor, observation: Observation, available: Available, noise:
     return actor.policy.sample(normalise(observation, actor.observation_rms), noise, available)
 
 
-def values(state: PPO, observation: Observation) -> Value:
+def values(state: PPO, observation: Observation) -> PerStep:
     """Return V(s) of normalised observations, in units of the reward."""
     return (state.return_rms.mean + _return_std(state.return_rms) * state.params.critic(observation))[..., 0]
 
@@ -124,12 +123,10 @@ def _return_std(return_rms: RunningMeanStd) -> Float[Array, " 1"]:
     return jnp.where(std > 0, std, 1)
 
 
-def advantages(
-    rollout: Rollout, value: Float[Array, "time actors"], next_value: Float[Array, "time actors"], settings: PPOSettings
-) -> Float[Array, "time actors"]:
+def advantages(rollout: Rollout, value: PerStep, next_value: PerStep, settings: PPOSettings) -> PerStep:
     """Return generalised advantage estimates (Schulman et al., 2016, Eq. 16), computed backwards through time.
 
-    `value` is the value of the observation before each step, and `next_value` of the one after it.
+    `value` is V of the observation before each step, and `next_value` of that after it.
     """
     discount = settings.gamma * (1 - rollout.terminated)
     deltas = rollout.reward + discount * next_value - value
@@ -144,21 +141,14 @@ def advantages(
 
 
 def policy_objective(
-    ratio: Float[Array, " batch"],
-    advantage: Float[Array, " batch"],
-    clip: float | Array,
-    mask: Float[Array, " batch"] | None = None,
+    ratio: PerStep, advantage: PerStep, clip: float | Array, mask: PerStep | None = None
 ) -> Float[Array, ""]:
     """Return the mean of min(rho A, clip(rho, 1 - c, 1 + c) A): Schulman et al. (2017), Eq. 7."""
     return masked_mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage), mask)
 
 
 def value_loss(
-    value: Float[Array, " batch"],
-    old_value: Float[Array, " batch"],
-    target: Float[Array, " batch"],
-    settings: PPOSettings,
-    mask: Float[Array, " batch"] | None = None,
+    value: PerStep, old_value: PerStep, target: PerStep, settings: PPOSettings, mask: PerStep | None = None
 ) -> Float[Array, ""]:
     """Return the mean of the larger of two Huber losses: of the value, and of the value clipped to `old_value` ± `value_clip`."""
     clipped = old_value + jnp.clip(value - old_value, -settings.value_clip, settings.value_clip)
@@ -173,7 +163,6 @@ def update(
 
     `progress_remaining` falls from 1 to 0 over the run, for annealing.
     """
-    # The batch is computed once, by the policy and the critic before the update.
     batch, return_rms, explained_variance = prepare_batch(state, rollout, settings)
     scale = progress_remaining if settings.anneal else 1.0
     rate, clip = settings.learning_rate * scale, settings.clip * scale
@@ -205,7 +194,7 @@ def update(
     (params, optimizer), metrics = jax.lax.scan(step, (state.params, state.optimizer), indices)
     metrics = jax.tree.map(jnp.mean, metrics) | {"critic/explained_variance": explained_variance}
 
-    # From the next rollout on, the networks see observations normalised by this rollout, too.
+    # Only now: in the update, the policy must see observations as it did when it acted.
     observation_rms = state.observation_rms
     if observation_rms is not None:
         rows = rollout.observation.reshape(-1, rollout.observation.shape[-1])
@@ -218,7 +207,7 @@ def prepare_batch(
 ) -> tuple[Batch, RunningMeanStd, Float[Array, ""]]:
     """Return all steps of all agents as one batch, the updated statistics of the returns, and the explained variance.
 
-    The explained variance is the share of the returns' variance that the critic predicted.
+    The explained variance is the share of the returns' variance that the critic predicted before the update.
     """
     mask = rollout.mask
     observation = normalise(rollout.observation, state.observation_rms)
@@ -259,5 +248,5 @@ def _bool_mask(mask: Float[Array, "time actors"] | None) -> Bool[Array, " batch"
     return None if mask is None else mask.ravel() > 0
 
 
-def _masked_variance(x: Value, mask: Value | None) -> Float[Array, ""]:
+def _masked_variance(x: PerStep, mask: PerStep | None) -> Float[Array, ""]:
     return jnp.var(x) if mask is None else masked_mean((x - masked_mean(x, mask)) ** 2, mask)

@@ -24,7 +24,7 @@ class QMIXSettings(SequenceSettings):
     embed: Count = 32
     """Width of the mixer."""
     hypernet: Count = 64
-    """Width of the hidden layers of the hypernetworks, which give the mixer's weights."""
+    """Width of the hidden layers of the hypernetworks, whose outputs are the mixer's weights."""
     learning_rate: Annotated[float, Field(gt=0)] = 1e-3
     """Learning rate of Adam."""
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
@@ -38,7 +38,7 @@ class QMIXSettings(SequenceSettings):
     epsilon_end: Annotated[float, Field(ge=0, le=1)] = 0.05
     """Probability that an agent explores, at the end."""
     epsilon_steps: Count = 100_000
-    """Environment steps of the linear fall from `epsilon_start` to `epsilon_end`."""
+    """Environment steps in which the probability falls linearly from start to end."""
 
 
 def _run_defaults(env: "EnvSpec", environments: int | None) -> dict[str, Any]:

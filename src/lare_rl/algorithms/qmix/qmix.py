@@ -27,6 +27,8 @@ __all__ = ["QMIX", "Memory", "act", "epsilon", "get_actor", "init", "init_memory
 
 Observations = Float[Array, "*batch agents observation"]
 Actions = Float[Array, "*batch agents action"]
+ActionValues = Float[Array, "*batch agents action"]
+"""Q_i(h_t, .): the value of each choice of an agent."""
 AvailableActions = Bool[Array, "*batch agents action"]
 Steps = Float[Array, "episodes steps"]
 
@@ -46,7 +48,7 @@ class QMIX(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What the agents remember from one step to the next."""
+    """The agents' hidden states and last actions."""
 
     hidden: Float[Array, "*batch agents hidden"]
     last_action: Actions
@@ -89,7 +91,7 @@ def agent_input(observation: Observations, last_action: Actions) -> Float[Array,
     return jnp.concatenate([observation, last_action, agent_id], axis=-1)
 
 
-def greedy_action(value: Actions, available: AvailableActions) -> Actions:
+def greedy_action(value: ActionValues, available: AvailableActions) -> Actions:
     """Return the available action of largest value; the first action if none is available, as in the padding of an episode."""
     return jax.nn.one_hot(jnp.argmax(jnp.where(available, value, -jnp.inf), axis=-1), value.shape[-1])
 
@@ -104,8 +106,8 @@ def act(
 ) -> tuple[Actions, Memory]:
     """Return the agents' actions, and their new memory.
 
-    Without noise, each agent takes the best of its available actions. Noise is uniform in [0, 1): an agent whose first number
-    is below `epsilon` explores, which means that it takes the available action whose number is the largest.
+    Without noise, each agent takes its available action of largest value. Noise is uniform in [0, 1). An agent whose first number
+    is below `epsilon` explores: it takes the available action with the largest of the other numbers.
     """
     value, hidden = agent(agent_input(observation, memory.last_action), memory.hidden)
     action = greedy_action(value, available)
@@ -126,9 +128,7 @@ def lambda_returns(
 ) -> Steps:
     """Return G, computed backwards from the end of the padding, where it is 0 (PyMARL2's `build_td_lambda_targets`)."""
     gamma, lambda_ = settings.gamma, settings.td_lambda
-    r_t, v_t = reward, value[:, 1:]
-    # What does not depend on later steps.
-    one_step = mask * (r_t + (1 - lambda_) * gamma * (1 - done) * v_t)
+    one_step = mask * (reward + (1 - lambda_) * gamma * (1 - done) * value[:, 1:])
     decay = lambda_ * gamma
 
     def step(next_return: Float[Array, " episodes"], one_step: Float[Array, " episodes"]):
@@ -155,7 +155,7 @@ def loss(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return half the mean squared error of Q_tot, and the mean of its targets."""
     value = action_values(online.agent, batch)
-    target_q = td_targets(target, value, batch, settings)  # without gradient: the online values only choose actions
+    target_q = td_targets(target, value, batch, settings)  # no gradient: the online values only choose actions
     q_total = mix(online.mixer, jnp.sum(value[:, :-1] * batch.action, axis=-1), batch.state[:, :-1])
     return masked_mean((q_total - target_q) ** 2, batch.mask) / 2, masked_mean(target_q, batch.mask)
 
@@ -164,8 +164,8 @@ def update(
     state: QMIX, batch: Sequences, copy_target: Bool[Scalar, ""], settings: QMIXSettings
 ) -> tuple[QMIX, Metrics]:
     """Take one gradient step on whole episodes. If `copy_target`, the target networks then become copies of the online ones."""
-    grad = jax.value_and_grad(loss, has_aux=True)
-    (td_loss, mean_target), gradient = grad(state.online, state.target, batch, settings)
+    loss_and_gradient = jax.value_and_grad(loss, has_aux=True)
+    (td_loss, mean_target), gradient = loss_and_gradient(state.online, state.target, batch, settings)
     gradient = clip_gradient(gradient, settings.max_grad_norm)
     online, optimizer = adam_step(state.online, gradient, state.optimizer, settings.learning_rate)
 

@@ -1,8 +1,8 @@
 """SAC: soft actor-critic with a learned temperature (Haarnoja et al., "Soft actor-critic algorithms and applications", 2018).
 
-    a', a ~ pi(. | s'), pi(. | s)
+    a'    ~ pi(. | s'),  a ~ pi(. | s),  and the replay has the action b
     y     = r + gamma * (1 - terminated) * (min_i Q'_i(s', a') - alpha log pi(a' | s'))
-    Q_i  <- descend mean (Q_i(s, a_replay) - y)^2                       Eq. 5, 6
+    Q_i  <- descend mean (Q_i(s, b) - y)^2                              Eq. 5, 6
     pi   <- descend mean (alpha log pi(a | s) - min_i Q_i(s, a))        Eq. 9
     alpha <- descend -alpha mean (log pi(a | s) + H),  H = -dim(A)      Eq. 18
     Q'   <- (1 - tau) Q' + tau Q                                        every target_every-th update
@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
-from lare_rl.algorithms.batches import Action, Metrics, Observation, Transitions
-from lare_rl.algorithms.critics import fit_critics, init_critics, q_values, td_target
+from lare_rl.algorithms.batches import Action, Metrics, Observation, PerStep, Transitions
+from lare_rl.algorithms.critics import Critics, bootstrapped_target, fit_critics, init_critics, q_values
 from lare_rl.algorithms.sac import SACSettings
 from lare_rl.nn.networks import MLP, adam_step, copy_networks, init_adam, polyak_update
 
@@ -30,8 +30,7 @@ MIN_LOG_STD, MAX_LOG_STD = -20.0, 2.0
 class Networks(NamedTuple):
     actor: MLP
     """From observations to mean and log std of each dimension of the action."""
-    critics: MLP
-    """All critics in one pytree, stacked on a leading axis."""
+    critics: Critics
     log_temperature: Float[Array, ""]
 
 
@@ -39,8 +38,7 @@ class SAC(NamedTuple):
     """Everything that SAC learns."""
 
     online: Networks
-    target: MLP
-    """The target critics."""
+    target: Critics
     actor_optimizer: optax.OptState
     critic_optimizer: optax.OptState
     temperature_optimizer: optax.OptState
@@ -50,7 +48,7 @@ def init(key: PRNGKeyArray, observation_size: int, action_size: int, settings: S
     """Return untrained networks."""
     actor_key, critic_key = jax.random.split(key)
     actor = MLP(observation_size, settings.hidden, 2 * action_size, key=actor_key)
-    critics = init_critics(critic_key, observation_size, action_size, settings.hidden, settings.critics)
+    critics = init_critics(critic_key, observation_size, action_size, settings)
     online = Networks(actor, critics, jnp.log(jnp.asarray(settings.temperature)))
     return SAC(
         online=online,
@@ -66,7 +64,7 @@ def get_actor(state: SAC) -> MLP:
     return state.online.actor
 
 
-def _normal(actor: MLP, observation: Observation) -> tuple[Action, Action]:
+def _mean_and_log_std(actor: MLP, observation: Observation) -> tuple[Action, Action]:
     """Return mean and log std of the policy, before the tanh."""
     mean, log_std = jnp.split(actor(observation), 2, axis=-1)
     return mean, jnp.clip(log_std, MIN_LOG_STD, MAX_LOG_STD)
@@ -74,20 +72,18 @@ def _normal(actor: MLP, observation: Observation) -> tuple[Action, Action]:
 
 def act(actor: MLP, observation: Observation) -> Action:
     """Return the deterministic policy's action, tanh(mu(s))."""
-    return jnp.tanh(_normal(actor, observation)[0])
+    return jnp.tanh(_mean_and_log_std(actor, observation)[0])
 
 
 def explore(actor: MLP, observation: Observation, noise: Action, settings: SACSettings) -> Action:
     """Return an action sampled from the policy. `noise` is standard normal."""
-    mean, log_std = _normal(actor, observation)
+    mean, log_std = _mean_and_log_std(actor, observation)
     return jnp.tanh(mean + jnp.exp(log_std) * noise)
 
 
-def sample(
-    actor: MLP, observation: Float[Array, "batch observation"], key: PRNGKeyArray
-) -> tuple[Float[Array, "batch action"], Float[Array, " batch"]]:
+def sample(actor: MLP, observation: Observation, key: PRNGKeyArray) -> tuple[Action, PerStep]:
     """Return sampled actions and their log pi: log normal density minus log slope of the tanh (appendix C, Eq. 21)."""
-    mean, log_std = _normal(actor, observation)
+    mean, log_std = _mean_and_log_std(actor, observation)
     noise = jax.random.normal(key, mean.shape)
     u = mean + jnp.exp(log_std) * noise
     log_density = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
@@ -96,12 +92,12 @@ def sample(
     return jnp.tanh(u), jnp.sum(log_density - log_slope, axis=-1)
 
 
-def soft_td_targets(state: SAC, batch: Transitions, key: PRNGKeyArray, settings: SACSettings) -> Float[Array, " batch"]:
-    """Return y: the reward, plus the discounted smallest target value with its entropy term, at a sampled action."""
+def soft_td_targets(state: SAC, batch: Transitions, key: PRNGKeyArray, settings: SACSettings) -> PerStep:
+    """Return y, whose next action is sampled from the online policy."""
     next_action, log_pi = sample(state.online.actor, batch.next_observation, key)
     next_q = jnp.min(q_values(state.target, batch.next_observation, next_action), axis=0)
     soft_value = next_q - jnp.exp(state.online.log_temperature) * log_pi
-    return td_target(batch, soft_value, settings.gamma)
+    return bootstrapped_target(batch, soft_value, settings.gamma)
 
 
 def update(
@@ -109,29 +105,29 @@ def update(
 ) -> tuple[SAC, Metrics]:
     """Update critics, actor and temperature. Every `target_every`-th update also moves the target critics.
 
-    `update_index` counts updates from 0. It is an argument, not part of the state, so that `vmap` over seeds keeps it a single
-    value.
+    `update_index` counts updates from 0, of all seeds (see `td3.update`).
     """
-    rate = settings.learning_rate
+    learning_rate = settings.learning_rate
     target_key, actor_key = jax.random.split(key)
     alpha = jnp.exp(state.online.log_temperature)
 
     target_q = soft_td_targets(state, batch, target_key, settings)
-    critics, critic_optimizer, loss = fit_critics(state.online.critics, batch, target_q, state.critic_optimizer, rate)
+    critics, critic_optimizer, loss = fit_critics(
+        state.online.critics, batch, target_q, state.critic_optimizer, learning_rate
+    )
 
-    # Improve the policy by the new critics.
     def actor_loss(actor: MLP) -> tuple[Float[Array, ""], Float[Array, ""]]:
         action, log_pi = sample(actor, batch.observation, actor_key)
         q = jnp.min(q_values(critics, batch.observation, action), axis=0)
         return jnp.mean(alpha * log_pi - q), jnp.mean(log_pi)
 
     gradient, log_pi = jax.grad(actor_loss, has_aux=True)(state.online.actor)
-    actor, actor_optimizer = adam_step(state.online.actor, gradient, state.actor_optimizer, rate)
+    actor, actor_optimizer = adam_step(state.online.actor, gradient, state.actor_optimizer, learning_rate)
 
     # Raise the temperature if the entropy, -log pi, is below -dim(A); lower it if above.
-    slope = -alpha * (log_pi - batch.action.shape[-1])
+    gradient = -alpha * (log_pi - batch.action.shape[-1])
     log_temperature, temperature_optimizer = adam_step(
-        state.online.log_temperature, slope, state.temperature_optimizer, rate
+        state.online.log_temperature, gradient, state.temperature_optimizer, learning_rate
     )
 
     target = jax.lax.cond(

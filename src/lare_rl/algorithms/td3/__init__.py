@@ -18,7 +18,7 @@ class TD3Settings(OffPolicySettings):
     policy_noise: Annotated[float, Field(ge=0)] = 0.2
     """Standard deviation of the noise on the target action, in action bounds."""
     noise_clip: Annotated[float, Field(ge=0)] = 0.5
-    """Bound of that noise."""
+    """Bound of the noise on the target action."""
     policy_delay: Count = 2
     """Critic updates for each update of actor and targets."""
     exploration_noise: Annotated[float, Field(ge=0)] = 0.1

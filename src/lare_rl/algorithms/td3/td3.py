@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
-from lare_rl.algorithms.batches import Action, Metrics, Observation, Transitions
-from lare_rl.algorithms.critics import fit_critics, init_critics, q_value, q_values, td_target
+from lare_rl.algorithms.batches import Action, Metrics, Observation, PerStep, Transitions
+from lare_rl.algorithms.critics import Critics, bootstrapped_target, fit_critics, init_critics, q_value, q_values
 from lare_rl.algorithms.td3 import TD3Settings
 from lare_rl.nn.networks import MLP, adam_step, copy_networks, init_adam, polyak_update
 
@@ -27,8 +27,7 @@ __all__ = ["TD3", "Networks", "act", "explore", "get_actor", "init", "td_targets
 
 class Networks(NamedTuple):
     actor: MLP
-    critics: MLP
-    """All critics in one pytree, stacked on a leading axis."""
+    critics: Critics
 
 
 class TD3(NamedTuple):
@@ -44,7 +43,7 @@ def init(key: PRNGKeyArray, observation_size: int, action_size: int, settings: T
     """Return untrained networks."""
     actor_key, critic_key = jax.random.split(key)
     actor = MLP(observation_size, settings.hidden, action_size, key=actor_key)
-    critics = init_critics(critic_key, observation_size, action_size, settings.hidden, settings.critics)
+    critics = init_critics(critic_key, observation_size, action_size, settings)
     online = Networks(actor, critics)
     return TD3(
         online=online,
@@ -69,15 +68,13 @@ def explore(actor: MLP, observation: Observation, noise: Action, settings: TD3Se
     return jnp.clip(act(actor, observation) + settings.exploration_noise * noise, -1, 1)
 
 
-def td_targets(
-    target: Networks, batch: Transitions, key: PRNGKeyArray, settings: TD3Settings
-) -> Float[Array, " batch"]:
-    """Return y: the reward, plus the discounted smallest target value at the target policy's action with clipped noise."""
+def td_targets(target: Networks, batch: Transitions, key: PRNGKeyArray, settings: TD3Settings) -> PerStep:
+    """Return y, whose next action is that of the target policy with clipped noise."""
     noise = settings.policy_noise * jax.random.normal(key, batch.action.shape)
     noise = jnp.clip(noise, -settings.noise_clip, settings.noise_clip)
     next_action = jnp.clip(act(target.actor, batch.next_observation) + noise, -1, 1)
     next_q = jnp.min(q_values(target.critics, batch.next_observation, next_action), axis=0)
-    return td_target(batch, next_q, settings.gamma)
+    return bootstrapped_target(batch, next_q, settings.gamma)
 
 
 def update(
@@ -85,23 +82,24 @@ def update(
 ) -> tuple[TD3, Metrics]:
     """Update the critics. Every `policy_delay`-th update also updates the actor and moves the targets.
 
-    `update_index` counts updates from 0. It is an argument, not part of the state, so that `vmap` over seeds keeps it a single
-    value and skips the delayed half instead of computing it and throwing it away.
+    `update_index` counts updates from 0. It is an argument, not part of the state, because all seeds share it: under `vmap`, a
+    condition on a batched number would compute the actor's update in every call.
     """
-    rate = settings.learning_rate
-
+    learning_rate = settings.learning_rate
     target_q = td_targets(state.target, batch, key, settings)
-    critics, critic_optimizer, loss = fit_critics(state.online.critics, batch, target_q, state.critic_optimizer, rate)
+    critics, critic_optimizer, loss = fit_critics(
+        state.online.critics, batch, target_q, state.critic_optimizer, learning_rate
+    )
 
     def actor_loss(actor: MLP) -> Float[Array, ""]:
         critic_1 = jax.tree.map(lambda leaf: leaf[0], critics)
         return -jnp.mean(q_value(critic_1, batch.observation, act(actor, batch.observation)))
 
     def update_actor(actor: MLP, target: Networks, optimizer: optax.OptState) -> tuple[MLP, Networks, optax.OptState]:
-        actor, optimizer = adam_step(actor, jax.grad(actor_loss)(actor), optimizer, rate)
+        actor, optimizer = adam_step(actor, jax.grad(actor_loss)(actor), optimizer, learning_rate)
         return actor, polyak_update(target, Networks(actor, critics), settings.tau), optimizer
 
-    # Improve the policy less often, so that the critics are accurate when it follows them.
+    # The policy is updated less often, so that the critics are accurate when it follows them.
     actor, target, actor_optimizer = jax.lax.cond(
         (update_index + 1) % settings.policy_delay == 0,
         update_actor,
