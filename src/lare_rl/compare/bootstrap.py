@@ -32,11 +32,10 @@ __all__ = [
 
 REPETITIONS = 2000
 """Number of bootstrap samples."""
-
 CHUNK = 100
-"""Samples that are in memory at a time."""
-
+"""The number of samples that are in memory at a time."""
 PERCENTILES = 2.5, 97.5
+"""The ends of an interval."""
 
 Scores = Float[np.ndarray, "*batch runs tasks"]
 OtherScores = Float[np.ndarray, "*batch other_runs tasks"]
