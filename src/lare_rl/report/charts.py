@@ -104,7 +104,7 @@ class Chart:
         if self.shaded_until > start:
             shapes.append(f'<rect class="shade" width="{scale_x([self.shaded_until])[0]:.0f}" height="{_UNITS}"/>')
         shapes += [*self._render_lines(scale_x, scale_y), *self._render_hovers(scale_x)]
-        tick_labels = _label_ticks(y_ticks)
+        tick_labels = [f"{tick:,.10g}" for tick in y_ticks]  # more digits would show errors of rounding
         texts = self._render_labels(scale_y)
         classes = f"chart{' low' if self.is_low else ''}{' labelled' if texts else ''}"
         texts += [
@@ -163,7 +163,7 @@ class Chart:
         edges = np.concatenate([[0], (centres[1:] + centres[:-1]) / 2, [_UNITS]])
         return [
             f'<rect class="hover" x="{x:.0f}" width="{end - x:.0f}" height="{_UNITS}"><title>{escape(text)}</title></rect>'
-            for (_, text), x, end in zip(chosen, edges, edges[1:], strict=False)
+            for (_, text), (x, end) in zip(chosen, pairwise(edges), strict=False)
         ]
 
 
@@ -195,7 +195,8 @@ def draw_legend(entries: Iterable[tuple[str, str]]) -> str:
 
 def draw_bars(bars: Sequence[Bar]) -> str:
     """Draw bars below each other, with their amounts as percentages."""
-    low, high = min([0.0, *(bar.amount for bar in bars)]), max([0.0, *(bar.amount for bar in bars)])
+    amounts = [bar.amount for bar in bars]
+    low, high = min(0.0, *amounts), max(0.0, *amounts)
     extent = max(high - low, 1e-9)
     items = []
     for bar in bars:
@@ -229,10 +230,8 @@ def draw_strips(rows: Mapping[str, Float[np.ndarray, "steps agents"]], shared_sc
         pixels = _to_colours(values.T, low, high)
         height = 28 if len(pixels) == 1 else 12 * len(pixels)
         text = f"{name}, from {format_number(low)} (dark) to {format_number(high)} (bright)"
-        strips.append(
-            f'<figure class="strip"><figcaption>{escape(text)}</figcaption><img alt="{escape(text)}" style="height:{height}px" '
-            f'src="{_encode_png(Image.fromarray(pixels))}"></figure>'
-        )
+        image = _render_image(Image.fromarray(pixels), text, f' style="height:{height}px"')
+        strips.append(f'<figure class="strip">{image}</figure>')
     return "".join(strips)
 
 
@@ -245,9 +244,7 @@ def draw_points(points: Float[np.ndarray, "points 2"], values: Float[np.ndarray,
     draw = ImageDraw.Draw(image)
     for (x, y), colour in zip(positions, _to_colours(values, low, high), strict=True):
         draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=tuple(map(int, colour)))
-    return (
-        f'<figure><figcaption>{escape(text)}</figcaption><img alt="{escape(text)}" src="{_encode_png(image)}"></figure>'
-    )
+    return f"<figure>{_render_image(image, text)}</figure>"
 
 
 def visible_steps(length: int) -> slice:
@@ -262,11 +259,14 @@ def _to_colours(values: Float[np.ndarray, "*shape"], low: float, high: float) ->
     return np.stack([np.interp(position, range(len(_VIRIDIS)), channel) for channel in _VIRIDIS.T], -1).astype(np.uint8)
 
 
-def _encode_png(image: Image.Image) -> str:
-    """Return an image as a data URL."""
+def _render_image(image: Image.Image, text: str, style: str = "") -> str:
+    """Return an image with its text, as a PNG of 64 colours."""
     file = io.BytesIO()
     image.quantize(64, Image.Quantize.FASTOCTREE).save(file, "PNG", optimize=True)
-    return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
+    data = base64.b64encode(file.getvalue()).decode()
+    return (
+        f'<figcaption>{escape(text)}</figcaption><img alt="{escape(text)}"{style} src="data:image/png;base64,{data}">'
+    )
 
 
 def _to_units(values: ArrayLike, low: float, high: float) -> np.ndarray:
@@ -283,17 +283,6 @@ def _choose_ticks(low: float, high: float, n_ticks: int) -> list[float]:
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(factor * power for factor in (1, 2, 2.5, 5, 10) if factor * power >= raw * 0.999)
     return [float(step * i) for i in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)] or [low]
-
-
-def _label_ticks(ticks: Sequence[float]) -> list[str]:
-    """Return the texts of ticks, with as many digits as they need, up to 8."""
-    texts = [list(map(format_number, ticks)), *([f"{tick:,.{n}g}" for tick in ticks] for n in range(4, 9))]
-    tolerance = 0.001 * (ticks[-1] - ticks[0])
-    return next((row for row in texts if _max_error(row, ticks) <= tolerance), texts[0])
-
-
-def _max_error(texts: Sequence[str], numbers: Sequence[float]) -> float:
-    return max(abs(float(text.replace(",", "")) - number) for text, number in zip(texts, numbers, strict=True))
 
 
 def _move_apart(positions: Float[np.ndarray, " labels"], gap: float) -> list[float]:

@@ -58,41 +58,6 @@ def evaluation_lines(
         yield from compare_actions(run, evaluation, likeliest)
 
 
-def _describe_returns(run: Run, evaluation: Evaluation, best_steps: Sequence[int] | None) -> Iterator[str]:
-    """Yield the returns of each seed. `best_steps` are the steps of the best policies."""
-    has_many_agents = load_env_spec(run.config.task).n_agents > 1
-    for team_index, prefix in enumerate(_team_prefixes(run.config.task)):
-        for seed_index, seed in enumerate(run.seeds):
-            line = f"{prefix}seed {seed}: {_format_returns(evaluation.returns[seed_index, :, team_index])}"
-            if best_steps is not None:
-                step = best_steps[seed_index]
-                untrained = ", before its first update" if step <= run.config.settings.warmup else ""
-                line += f" (the policy of step {step:,}{untrained})"
-            if has_many_agents:
-                sums = evaluation.summed_returns[seed_index, :, team_index]
-                line += f"; summed over the agents {format_mean_std(sums)}"
-            yield line
-
-
-def _team_prefixes(task: TaskSpec) -> list[str]:
-    """Return the beginnings of lines about each team. They are empty for a task without teams."""
-    return [f"{role.name}, " if len(task.roles) > 1 else "" for role in task.roles]
-
-
-def _format_returns(returns: Float[np.ndarray, " episodes"]) -> str:
-    return f"return {format_mean_std(returns)} over {format_for_reader(len(returns), 'count episode')}"
-
-
-def compare_actions(run: Run, sampled: Evaluation, likeliest: Evaluation) -> Iterator[str]:
-    """Say which actions are better, if that is clear. Both evaluations play from the same initial states."""
-    for team_index, role in enumerate(run.config.task.roles):
-        difference = mean_with_error((likeliest.returns - sampled.returns)[:, :, team_index])
-        if difference is not None and abs(difference[0]) > CLEAR_ERRORS * difference[1]:
-            better = "better: use `--deterministic` here, and `load_policy(..., deterministic=True)` in Python"
-            verdict = better if difference[0] > 0 else "worse: let the policy sample"
-            yield f"{role.name}: the most likely actions are {verdict} ({format_plus_minus(*difference)})"
-
-
 def describe_evaluation(
     run: Run, evaluation: Evaluation, random_episodes: Sequence[Sequence[Episode]], best_steps: Sequence[int] | None
 ) -> Iterator[str]:
@@ -119,3 +84,38 @@ def describe_evaluation(
         if random_episodes[0]:
             values = np.array([episode.measures[name] for episode in random_episodes[0]])
             yield f"random actions: {name} {format_mean_std(values)}"
+
+
+def compare_actions(run: Run, sampled: Evaluation, likeliest: Evaluation) -> Iterator[str]:
+    """Say which actions are better, if that is clear. Both evaluations play from the same initial states."""
+    for team_index, role in enumerate(run.config.task.roles):
+        difference = mean_with_error((likeliest.returns - sampled.returns)[:, :, team_index])
+        if difference is not None and abs(difference[0]) > CLEAR_ERRORS * difference[1]:
+            better = "better: use `--deterministic` here, and `load_policy(..., deterministic=True)` in Python"
+            verdict = better if difference[0] > 0 else "worse: let the policy sample"
+            yield f"{role.name}: the most likely actions are {verdict} ({format_plus_minus(*difference)})"
+
+
+def _describe_returns(run: Run, evaluation: Evaluation, best_steps: Sequence[int] | None) -> Iterator[str]:
+    """Yield the returns of each seed. `best_steps` are the steps of the best policies."""
+    has_many_agents = load_env_spec(run.config.task).n_agents > 1
+    for team_index, prefix in enumerate(_team_prefixes(run.config.task)):
+        for seed_index, seed in enumerate(run.seeds):
+            line = f"{prefix}seed {seed}: {_format_returns(evaluation.returns[seed_index, :, team_index])}"
+            if best_steps is not None:
+                step = best_steps[seed_index]
+                untrained = ", before its first update" if step <= run.config.settings.warmup else ""
+                line += f" (the policy of step {step:,}{untrained})"
+            if has_many_agents:
+                sums = evaluation.summed_returns[seed_index, :, team_index]
+                line += f"; summed over the agents {format_mean_std(sums)}"
+            yield line
+
+
+def _team_prefixes(task: TaskSpec) -> list[str]:
+    """Return the beginnings of lines about each team. They are empty for a task without teams."""
+    return [f"{role.name}, " if len(task.roles) > 1 else "" for role in task.roles]
+
+
+def _format_returns(returns: Float[np.ndarray, " episodes"]) -> str:
+    return f"return {format_mean_std(returns)} over {format_for_reader(len(returns), 'count episode')}"

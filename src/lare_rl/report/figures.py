@@ -86,11 +86,7 @@ def draw_bands_on(axes: Axes, bands: Mapping[str, Band], x_is_steps: bool) -> No
         axes.plot(x, y, color=colour, linestyle=line, label=name, drawstyle="default" if x_is_steps else "steps-post")
         axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0, step=None if x_is_steps else "post")
     if x_is_steps:
-        axes.xaxis.set_major_formatter(_format_steps)
-
-
-def _format_steps(x: float, _: Any) -> str:
-    return format_for_reader(x, "steps")
+        axes.xaxis.set_major_formatter(lambda x, _: format_for_reader(x, "steps"))
 
 
 def _add_legend(axes: Axes) -> None:

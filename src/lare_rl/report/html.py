@@ -1,7 +1,7 @@
 """The parts of an HTML page, and the page itself."""
 
 import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -9,7 +9,9 @@ from pathlib import Path
 from lare_rl.latent.function import LatentFunction
 from lare_rl.util.files import write_bytes
 
-__all__ = ["render_film", "render_fold", "render_function", "render_note", "render_table", "render_tiles", "write_page"]
+__all__ = [
+    "render_figures", "render_film", "render_fold", "render_function", "render_note", "render_table", "render_tiles", "write_page",
+]  # fmt: skip
 
 _EMPTY = ("", "-")
 """Texts of empty cells."""
@@ -63,6 +65,15 @@ def render_fold(title: str, sections: Iterable[str]) -> str:
     """Return sections under a title that opens them, or an empty text without sections."""
     content = "\n".join(filter(None, sections))
     return f"<details><summary>{escape(title)}</summary>\n{content}\n</details>" if content else ""
+
+
+def render_figures(figures: Mapping[str, str]) -> str:
+    """Return charts side by side under their titles, or an empty text without charts."""
+    items = (
+        f'<figure><figcaption class="title">{escape(title)}</figcaption>{chart}</figure>'
+        for title, chart in figures.items()
+    )
+    return f'<div class="figures">{"".join(items)}</div>' if figures else ""
 
 
 def render_tiles(tiles: Iterable[tuple[str, str, str]]) -> str:

@@ -11,7 +11,7 @@ from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.report.charts import N_COLOURS, Chart, Line, draw_legend
 from lare_rl.report.diagnosis import diagnose
-from lare_rl.report.html import render_fold, render_note, render_table, render_tiles
+from lare_rl.report.html import render_figures, render_fold, render_note, render_table, render_tiles
 from lare_rl.report.messages import MESSAGES, WORDS
 from lare_rl.report.reported_run import Curve, ReportedRun, finite, mean_over_seeds
 from lare_rl.report.run_summary import MIN_SEEDS, EpisodicRun, RunSummary, summarise_run
@@ -215,17 +215,17 @@ def render_learning_curves(
     for metric, random_mean in zip(returns, random_means, strict=True):
         if chart := _draw_metric(metric, runs, colours, warmup, random_mean):
             yield render_note(metric.title) + chart
-    figures = [
-        f'<figure><figcaption class="title">{escape(metric.title)}</figcaption>{chart}</figure>'
+    charts = {
+        metric.title: chart
         for metric in _other_metrics(task)
         if (chart := _draw_metric(metric, runs, colours, warmup, label_gap=9.0))
-    ]
+    }
     if task.name in REFERENCE_RETURNS:
         published = format_number(REFERENCE_RETURNS[task.name].trained)
         yield render_note(
             f"For comparison: TD3 on true rewards reaches about {published} within a million steps, as published."
         )
-    yield render_fold("More curves", ['<div class="figures">', *figures, "</div>"] if figures else ())
+    yield render_fold("More curves", [render_figures(charts)])
 
 
 def _other_metrics(task: TaskSpec) -> Iterable[_Metric]:

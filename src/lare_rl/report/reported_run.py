@@ -57,7 +57,7 @@ class ReportedRun:
         """Return the finite values of a metric at the last evaluation."""
         return finite(self.values(key)[:, -1:])
 
-    def last_values(self, key: str) -> Float[np.ndarray, " finite_seeds"]:
+    def last_finite_values(self, key: str) -> Float[np.ndarray, " finite_seeds"]:
         """Return the finite values of a metric at the last evaluation that has any. Empty if none has."""
         return next((numbers for column in self.values(key).T[::-1] if len(numbers := finite(column))), np.zeros(0))
 

@@ -19,7 +19,7 @@ from lare_rl.evaluation.episode_credit import EpisodeCredit, FactorLabel, label_
 from lare_rl.evaluation.played_episodes import PlayedEpisodes, TeamSample, sample_steps
 from lare_rl.latent.saved import read_source
 from lare_rl.report.charts import Bar, Chart, Line, draw_bars, draw_legend, draw_points, draw_strips, visible_steps
-from lare_rl.report.html import render_fold, render_function, render_note, render_table
+from lare_rl.report.html import render_figures, render_fold, render_function, render_note, render_table
 from lare_rl.report.messages import WORDS
 from lare_rl.report.reported_run import ReportedRun, finite
 from lare_rl.runs.directory import Run, function_paths
@@ -111,7 +111,7 @@ def _render_credit(credit: EpisodeCredit, labels: Sequence[FactorLabel], trust: 
         f"rewards {format_number(proxy.sum())}.{'' if band is None else _BAND_NOTE}"
     )
     if labels:
-        yield render_fold("The factors over the same steps", _draw_factors(credit.factors[steps, 0], x, labels))
+        yield render_fold("The factors over the same steps", [_draw_factors(credit.factors[steps, 0], x, labels)])
 
 
 def _render_heading(title: str, word: str) -> str:
@@ -121,15 +121,14 @@ def _render_heading(title: str, word: str) -> str:
 
 def _draw_factors(
     factors: Float[np.ndarray, "steps factors"], x: Float[np.ndarray, " steps"], labels: Sequence[FactorLabel]
-) -> Iterable[str]:
-    yield '<div class="figures">'
+) -> str:
     # The values after a step are those before the next, so a factor needs one curve.
     curves = {base_name(label.name): factor for label, factor in zip(labels, factors.T, strict=True)}
+    charts = {}
     for name, factor in curves.items():
         text = f"{name} over the steps of an episode"
-        chart = Chart(lines=[Line(x, factor, "c0")], description=text, x_label="step", is_low=True).render()
-        yield f'<figure><figcaption class="title">{escape(name)}</figcaption>{chart}</figure>'
-    yield "</div>"
+        charts[name] = Chart(lines=[Line(x, factor, "c0")], description=text, x_label="step", is_low=True).render()
+    return render_figures(charts)
 
 
 def _render_earnings(run: Run, correlations: Sequence[Float[np.ndarray, " factors"]]) -> Iterable[str]:

@@ -293,7 +293,9 @@ def _episode_error(reported: ReportedRun) -> float:
 
 def _score_metrics(reported: ReportedRun) -> dict[str, float]:
     """Return the last metrics about the score, NaN where they are missing: means over the seeds, and the error of the mean gain."""
-    values = {key: reported.last_values(f"credit/{key}") for key in ("average", "log_odds", "gain", "gain_error")}
+    values = {
+        key: reported.last_finite_values(f"credit/{key}") for key in ("average", "log_odds", "gain", "gain_error")
+    }
     metrics = {key: float(numbers.mean()) if len(numbers) else math.nan for key, numbers in values.items()}
     errors = values["gain_error"]
     return metrics | {"gain_error": math.sqrt(np.sum(errors**2)) / len(errors) if len(errors) else math.nan}
@@ -301,5 +303,5 @@ def _score_metrics(reported: ReportedRun) -> dict[str, float]:
 
 def _last_mean(reported: ReportedRun, key: str) -> float | None:
     """Return the mean of the last values of a metric, or None if it was never measured."""
-    values = reported.last_values(key)
+    values = reported.last_finite_values(key)
     return float(values.mean()) if len(values) else None
