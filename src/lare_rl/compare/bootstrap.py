@@ -7,6 +7,7 @@ the Statistical Precipice", NeurIPS 2021, sections 4.1 to 4.3), and the exact te
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,6 +17,7 @@ from lare_rl.util.statistics import format_rounded, wins
 __all__ = [
     "REPETITIONS",
     "Estimate",
+    "Intervals",
     "OtherScores",
     "Scores",
     "bootstrap",
@@ -37,8 +39,6 @@ PERCENTILES = 2.5, 97.5
 
 Scores = Float[np.ndarray, "*batch runs tasks"]
 OtherScores = Float[np.ndarray, "*batch other_runs tasks"]
-_Intervals = tuple[Float[np.ndarray, "*values"], Float[np.ndarray, "*values"], Float[np.ndarray, "*values"]]
-"""Numbers, and the lower and upper ends of their intervals."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,14 @@ class Estimate:
             return format_rounded(self.value, 0.0)
         texts = (format_rounded(number, self.high - self.low) for number in (self.value, self.low, self.high))
         return "{} [{}, {}]".format(*texts)
+
+
+class Intervals(NamedTuple):
+    """Numbers and their 95% intervals."""
+
+    value: Float[np.ndarray, "*values"]
+    low: Float[np.ndarray, "*values"]
+    high: Float[np.ndarray, "*values"]
 
 
 def interquartile_mean(scores: Scores) -> Float[np.ndarray, "*batch"]:
@@ -92,7 +100,7 @@ def estimate(function: Callable[..., Float[np.ndarray, "*batch"]], *scores: Floa
     return Estimate(*map(float, bootstrap(function, *scores)))
 
 
-def bootstrap(function: Callable[..., Float[np.ndarray, "*_"]], *scores: Float[np.ndarray, "*_"]) -> _Intervals:
+def bootstrap(function: Callable[..., Float[np.ndarray, "*_"]], *scores: Float[np.ndarray, "*_"]) -> Intervals:
     """Return the values of a function of scores, and the ends of their intervals: percentiles over samples of the runs.
 
         x*_nm = x_(i_nm) m,   i_nm uniform in 1 .. N, independent for each run n and task m
@@ -111,7 +119,7 @@ def bootstrap(function: Callable[..., Float[np.ndarray, "*_"]], *scores: Float[n
         indices = [[random.randint(x.shape[-2], size=x.shape[-2:]) for x in scores] for _ in range(n_samples)]
         samples.append(function(*map(_resample, scores, zip(*indices, strict=True))))
     low, high = np.percentile(np.concatenate(samples), PERCENTILES, axis=0)
-    return function(*(array[None] for array in scores))[0], low, high
+    return Intervals(function(*(array[None] for array in scores))[0], low, high)
 
 
 def _resample(

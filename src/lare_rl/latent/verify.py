@@ -141,7 +141,7 @@ def _advice(graph: Graph, names: Sequence[str], factors: Float[np.ndarray, "step
             yield f"factor {name!r} never varies on the recorded steps"
     standardized = (factors[:, varies] - factors[:, varies].mean(axis=0)) / std[varies]
     correlations = np.abs(standardized.T @ standardized) / len(factors)
-    varying = np.flatnonzero(varies)
+    varying = np.flatnonzero(varies).tolist()
     for i, j in np.argwhere(np.triu(correlations > 0.9999, 1)):
         yield f"factor {names[varying[j]]!r} repeats {names[varying[i]]!r} on the recorded steps"
 
