@@ -87,6 +87,7 @@ CALLS = {
     "policy.select_env_action([[0, 0]])": "of shape (2,), and was given an array of shape (1, 2)",
     "lare_rl.export_run('none', 'out')": "none is not a run",
     "lare_rl.design(task, 'rewards')": "'rewards': it is factors or reward",
+    "lare_rl.design(task, candidates=2.5)": "candidates = 2.5",
     "verify_function(PHI, task, 'rewards')": "'rewards': it is factors or reward",
     "lare_rl.design(task, steps=7)": "two arrays",
     "lare_rl.design(task, steps=(7, 7))": "the shape (n, 2)",

@@ -29,7 +29,7 @@ def test_page_of_several_tasks(make_run, tmp_path):
     assert "Reacher-v4 (0 is -44, 1 is -2.7), Walker2d-v4 (0 is 3.4, 1 is 4600)" in page
     assert page.count("<svg") == 2
     config = runs[0].config
-    facts = (f"LaRe {config.lare}", f"JAX {config.versions['jax']}", config.machine, "10 episodes in each evaluation")
+    facts = (f"LaRe {config.lare}", f"JAX {config.versions['jax']}", config.machine, "episodes of an evaluation 10")
     assert all(fact in page for fact in facts)
     assert find_score_meaning(comparison).code == "scaled_scores"
 
@@ -93,10 +93,10 @@ def test_smallest_p(make_run):
 @pytest.mark.parametrize(
     ("tasks", "draws", "expected"),
     [
-        (["Walker2d-v4"], [[1.0, 2.0, 6.0]], [("few_seeds", 3, 0.75)]),
-        (["Walker2d-v4"], [[1.0] * 4] * 2, [("few_draws", 2, 0.5)]),
+        (["Walker2d-v4"], [[1.0, 2.0, 6.0]], [("few_values", "seeds", 3, 0.75)]),
+        (["Walker2d-v4"], [[1.0] * 4] * 2, [("few_values", "draws", 2, 0.5)]),
         (["Walker2d-v4"], [[1.0]], []),
-        (["Walker2d-v4", "Reacher-v4"], [[1.0, 2.0, 3.0]], [("few_over_tasks", None, None)]),
+        (["Walker2d-v4", "Reacher-v4"], [[1.0, 2.0, 3.0]], [("few_over_tasks", None, None, None)]),
     ],
 )
 def test_small_samples(tasks, draws, expected, make_run):
@@ -107,7 +107,7 @@ def test_small_samples(tasks, draws, expected, make_run):
     ]
     comparison = compare(read(runs))
     findings = list(find_small_samples(comparison))
-    assert [(finding.code, *map(finding.values.get, ("count", "coverage"))) for finding in findings] == expected
+    assert [(finding.code, *map(finding.values.get, ("noun", "count", "coverage"))) for finding in findings] == expected
     assert to_text(findings) in describe(comparison)
 
 

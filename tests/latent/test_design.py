@@ -157,7 +157,7 @@ def test_record(chase, tmp_path):
             existed.append(path.exists())
             return super().reply(messages, number)
 
-    function = design(chase, model=CheckingModel(replies=[MALFORMED, GOOD]), candidates=1, record=path)
+    function = design(chase, model=CheckingModel(replies=[MALFORMED, GOOD]), candidates=1, record=str(path))
     assert existed == [False, True]
     content = path.read_text(encoding="utf-8")
     recording = read_recording(content, "record.json")

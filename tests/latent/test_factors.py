@@ -5,7 +5,7 @@ import pytest
 
 from helpers.toy_envs import PHI, phi_source
 from lare_rl.latent import factors as factors_module
-from lare_rl.latent.factors import compute_batch, find_infinity
+from lare_rl.latent.factors import compute_batch, find_nonfinite_operation
 from lare_rl.phi.read import read
 
 
@@ -35,5 +35,5 @@ def test_compute_factors_in_chunks(monkeypatch):
         ("return [action, action]", None),
     ],
 )
-def test_find_infinity_of_the_second_factor(body, origin):
-    assert find_infinity(read(phi_source(body), 2, 1), 1, *random_steps(3)) == origin
+def test_find_nonfinite_operation_of_the_second_factor(body, origin):
+    assert find_nonfinite_operation(read(phi_source(body), 2, 1), 1, *random_steps(3)) == origin

@@ -111,7 +111,6 @@ def test_names_meanings_features_and_source(function):
     other = replace(function, source=source)
     assert other.names == ["factor_1", "energy"]
     assert other.meanings == ["", "energy, squared"]
-    assert function.features_read == [{"observation": [0], "action": [0]}, {"observation": [], "action": [0]}]
     assert function.reads == ["observation[0], action[0]", "action[0]"]
     assert features_text({"observation": [], "action": []}) == "nothing"
     indices = {"observation": [8, 9, 13], "action": [0, 1, 2, 3, 4, 5]}

@@ -14,9 +14,9 @@ def test_max_request_tokens_counts_bytes():
 
 def test_max_reply_tokens():
     budget = Budget(tokens=100, tokens_in=30, tokens_out=20)
-    assert budget.max_reply_tokens(REQUEST) == 100 - 50 - 23
+    assert budget.max_reply_tokens(REQUEST, 27) == 100 - 50 - 23
     with pytest.raises(BudgetExceededError, match=r"100 tokens \(50 are used\)"):
-        budget.max_reply_tokens(REQUEST * 3)
+        budget.max_reply_tokens(REQUEST, 28)
 
 
 def test_summary_with_prices():

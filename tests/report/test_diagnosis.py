@@ -26,8 +26,7 @@ def find(returns, **facts):
     """The findings, by code."""
     returns = np.asarray(returns, float)
     summary = {"steps": STEPS[: returns.shape[1]], "returns": returns, "random_returns": RANDOM, "directory": "runs/x"}
-    findings = diagnose(RunSummary(**(summary | facts)))
-    return {finding.code: finding for finding in findings}
+    return {finding.code: finding for _, finding in diagnose(RunSummary(**(summary | facts)))}
 
 
 @pytest.mark.parametrize(

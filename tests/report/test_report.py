@@ -16,7 +16,9 @@ from helpers.toy_envs import Chase, toy_spec
 from helpers.untrained_runs import write_run
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
+from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import load_task
+from lare_rl.evaluation.played_episodes import TeamSample
 from lare_rl.evaluation.video import encode_film
 from lare_rl.report import live_page, run_details
 from lare_rl.report.html import render_table, write_page
@@ -164,7 +166,11 @@ def test_names_of_runs(make_run, tmp_path):
     assert "&lt;b&gt;c" in page
     assert default_path([tmp_path]) == tmp_path / "report.html"
     assert default_path([tmp_path, tmp_path / "b"]) == Path("report.html")
-    for sources, out, words in (([], "report.html", "No runs"), ([first], "no/report.html", "no directory")):
+    for sources, out, words in (
+        ([], "report.html", "No runs"),
+        (7, "report.html", "lare_rl.open_run"),
+        ([first], "no/report.html", "no directory"),
+    ):
         with pytest.raises(lare_rl.LareError, match=words):
             lare_rl.write_report(sources, tmp_path / out)
 
@@ -201,7 +207,10 @@ def test_error_of_the_mean_gain(make_run):
 def test_each_team_is_compared_with_its_own_random_returns(tmp_path):
     task = load_task("CompetitivePP-6")
     settings = resolve(Settings(method="dense"), task)
-    metrics = [{"step": 1, "seed": 0, "evaluation/return_predator": 1.0, "evaluation/return_prey": 1.0}]
+    names = ("return", "return_std")
+    metrics = [
+        {"step": 1, "seed": 0, **{f"evaluation/{name}_{team}": 1.0 for name in names for team in ("predator", "prey")}}
+    ]
     write_run(tmp_path / "run", task, settings, metrics)
     reported = ReportedRun("a", open_without_functions(tmp_path / "run"))
     charts = [
@@ -209,6 +218,7 @@ def test_each_team_is_compared_with_its_own_random_returns(tmp_path):
         for returns in ([[0.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [-9.0, -9.0]])
     ]
     assert [first == second for first, second in zip(*charts, strict=True)] == [True, False]
+    assert all('class="band c0"' in chart for chart in charts[0])  # as the legend says
 
 
 def test_run_without_evaluation(make_run, tmp_path):
@@ -256,6 +266,26 @@ def test_texts_and_tables(make_run, monkeypatch, tmp_path):
     assert table.count("&lt;") == 2
     page = write_page(tmp_path / "page.html", "<a>\udcff", "\ud83d").read_text(encoding="utf-8")
     assert "<title>&lt;a&gt;\\udcff</title>" in page
+
+
+def test_unknown_correlations_have_no_note():
+    sample = TeamSample(next_observation=np.eye(3), factors=np.eye(3)[:, :2], reward=np.arange(3.0))
+    assert "0.58 for the 3 entries" in run_details._render_correlations(sample)
+    assert run_details._render_correlations(replace(sample, reward=np.zeros(3))) == ""
+
+
+def test_factors_that_never_vary_have_no_picture():
+    pytest.importorskip("sklearn")
+    numbers = np.random.default_rng(0).normal(size=(40, 3))
+    sample = TeamSample(next_observation=numbers, factors=np.full((40, 2), 0.1, np.float32), reward=numbers[:, 0])
+    page = "".join(run_details._render_tsne(sample))
+    assert "t-SNE of the observations" in page
+    assert "t-SNE of the factors" not in page
+
+
+def test_method_without_summary(make_run, monkeypatch):
+    monkeypatch.setitem(METHODS._values, "dense", replace(METHODS["dense"], summary="", source=""))
+    assert run_details.describe_method(make_run("a", [1.0])) == ""
 
 
 def test_live_page(make_run, monkeypatch):

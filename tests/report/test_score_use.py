@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 
 from helpers.toy_envs import toy_spec
@@ -8,7 +9,7 @@ from lare_rl.report.messages import MESSAGES
 from lare_rl.report.score_use import summarise_score_use
 from lare_rl.util.findings import render
 
-METRICS = {"average": None, "log_odds": None, "gain": 0.5, "gain_error": 0.05}
+METRICS = {"average": np.nan, "log_odds": np.nan, "gain": 0.5, "gain_error": 0.05}
 
 
 def describe(method="bayes", metrics=METRICS, task=None, equal_lengths=False, **credit):
@@ -46,5 +47,5 @@ def test_sum_and_average_of_equal_lengths_are_not_told_apart():
 
 
 def test_nothing_is_said_without_predictions():
-    assert describe(metrics=METRICS | {"gain": None, "gain_error": None})[1] == ""
+    assert describe(metrics=METRICS | {"gain": np.nan, "gain_error": np.nan})[1] == ""
     assert describe("ircr")[0] is None

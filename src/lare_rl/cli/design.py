@@ -71,7 +71,8 @@ def design(
     """
     import lare_rl
     from lare_rl.envs.load import read_task
-    from lare_rl.llm.model import RECORDED, recorded_model
+    from lare_rl.llm.model import recorded_model
+    from lare_rl.llm.recording import RECORDED
 
     model_name = RECORDED if model_name is None else model_name
     is_live = model_name != RECORDED and not model_name.endswith(".json")

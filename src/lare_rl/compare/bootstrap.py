@@ -32,11 +32,10 @@ __all__ = [
 
 REPETITIONS = 2000
 """Number of bootstrap samples."""
-
 CHUNK = 100
-"""Samples that are in memory at a time."""
-
+"""The number of samples that are in memory at a time."""
 PERCENTILES = 2.5, 97.5
+"""The ends of an interval."""
 
 Scores = Float[np.ndarray, "*batch runs tasks"]
 OtherScores = Float[np.ndarray, "*batch other_runs tasks"]
@@ -102,7 +101,7 @@ def estimate(function: Callable[..., Float[np.ndarray, "*batch"]], *scores: Floa
 
 
 def bootstrap(function: Callable[..., Float[np.ndarray, "*_"]], *scores: Float[np.ndarray, "*_"]) -> Intervals:
-    """Estimate the values of a function of scores. Their intervals are percentiles over samples of the runs.
+    """Return the values of a function of scores, and the ends of their intervals: percentiles over samples of the runs.
 
         x*_nm = x_(i_nm) m,   i_nm uniform in 1 .. N, independent for each run n and task m
 

@@ -39,8 +39,8 @@ def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[L
     results = run_results + table_results
     if first := next((result.label for result in table_results if result.source == paths[0]), None):
         results.sort(key=lambda result: result.label != first)
-    several = len({result.label for result in results}) > 1
-    if differences := (find_differences(runs) if several else []) + find_origin_differences(runs):
+    has_several_labels = len({result.label for result in results}) > 1
+    if differences := (find_differences(runs) if has_several_labels else []) + find_origin_differences(runs):
         findings.append(Finding("differ", {"differences": tuple(differences)}))
     return results, findings
 
@@ -78,7 +78,7 @@ def select_runs(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], l
 
 
 def _find_other_tasks(run_results: Sequence[LearningCurve], table_results: Sequence[LearningCurve]) -> list[Finding]:
-    """Return the tasks of tables that no run has."""
+    """Report the tasks of tables that no run has."""
     tasks = tuple(sorted({result.task for result in run_results}))
     unknown = dict.fromkeys((result.source, result.task) for result in table_results if result.task not in tasks)
     return [Finding("other_task", {"source": source, "task": task, "tasks": tasks}) for source, task in unknown]
@@ -87,7 +87,7 @@ def _find_other_tasks(run_results: Sequence[LearningCurve], table_results: Seque
 def _find_other_steps(
     run_results: Sequence[LearningCurve], table_results: Sequence[LearningCurve], metric: str
 ) -> list[Finding]:
-    """Return the methods of tables that lack the last step of the runs."""
+    """Report the methods of tables that lack the last step of the runs."""
     curves = group_pairs((result.task, result.values) for result in run_results if result.values)
     last_steps = {task: min(map(max, values)) for task, values in curves.items()}  # of the shortest curve on each task
     missing = dict.fromkeys(
@@ -95,5 +95,7 @@ def _find_other_steps(
         for result in table_results
         if (step := last_steps[result.task]) not in result.values
     )
-    values = [{"source": source, "metric": metric, "label": label, "step": step} for source, label, step in missing]
-    return [Finding("other_steps", value) for value in values]
+    return [
+        Finding("other_steps", {"source": source, "metric": metric, "label": label, "step": step})
+        for source, label, step in missing
+    ]

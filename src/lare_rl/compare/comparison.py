@@ -26,15 +26,25 @@ from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
 from lare_rl.util.statistics import Band, sample_std
 
-__all__ = ["Comparison", "Row", "compare", "compare_over_tasks", "compare_tasks"]
+__all__ = ["Comparison", "OverallRow", "Row", "compare", "compare_over_tasks", "compare_tasks"]
 
 
 @dataclass(frozen=True)
-class Row:
-    """One method, over all tasks."""
+class OverallRow:
+    """One method compared with the baseline over tasks whose scores need no common scale."""
 
     label: str
     n_seeds: int
+    improvement: Estimate | None
+    """Probability that a run scores more than a run of the baseline; None for the baseline and for single seeds."""
+    p_value: float | None
+    """The two-sided p-value of the exact Mann-Whitney test against the baseline; None like `improvement`."""
+
+
+@dataclass(frozen=True)
+class Row(OverallRow):
+    """One method, over tasks whose scores have a common scale."""
+
     n_draws: int
     iqm: Estimate
     """Interquartile mean, its interval over the seeds."""
@@ -44,22 +54,7 @@ class Row:
     draw_mean: Estimate | None
     """The mean, its interval over the draws; None for a single draw."""
     difference: Estimate | None
-    """The difference of the interquartile means to the baseline's; None for the baseline and for single seeds."""
-    improvement: Estimate | None
-    """Probability that a run scores more than a run of the baseline; None like `difference`."""
-    p_value: float | None
-    """The two-sided p-value of the exact Mann-Whitney test against the baseline. None like `difference`."""
-
-
-@dataclass(frozen=True)
-class OverallRow:
-    """One method compared with the baseline over tasks whose scores have no common scale."""
-
-    label: str
-    n_seeds: int
-    improvement: Estimate | None
-    """As in `Row`."""
-    p_value: float | None
+    """The interquartile mean minus that of the baseline; None like `improvement`."""
 
 
 @dataclass(frozen=True)
@@ -68,9 +63,9 @@ class Comparison:
 
     rows: tuple[Row, ...]
     curves: Mapping[str, Band]
-    """Interquartile mean by step, of each label."""
+    """The interquartile mean at each step, by label."""
     profiles: Mapping[str, Band]
-    """Share of runs that score more than x, of each label."""
+    """The share of runs that score more than x, by label."""
     groups: Mapping[str, LabelScores]
     """The scores, by label."""
     choice: ScoreChoice
@@ -82,7 +77,7 @@ class Comparison:
 
     @property
     def normalised(self) -> bool:
-        """Whether scores are scaled, because there are several tasks."""
+        """Whether scores are scaled, as those of several tasks are."""
         return len(self.tasks) > 1
 
     @property
@@ -126,8 +121,8 @@ def compare_over_tasks(comparisons: Sequence[Comparison]) -> list[OverallRow]:
     """Compare methods with the baseline over the tasks of several comparisons.
 
     Runs are compared with runs on the same task by their order alone, so the tasks need no common scale. Each task has the same
-    weight. Only methods that ran on every task, with equally many seeds, are compared. There are no rows if there are fewer than two
-    such methods, or if the comparisons have different baselines.
+    weight. A row needs a method that ran on every task with equally many seeds. There are no rows without such a method besides the
+    baseline, or if the comparisons have different baselines.
     """
     if len(comparisons) < 2:
         return []

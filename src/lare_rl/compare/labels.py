@@ -12,7 +12,7 @@ from lare_rl.credit.methods import METHODS
 from lare_rl.runs.config_file import Config
 from lare_rl.runs.directory import Run
 
-__all__ = ["find_differences", "find_origin_differences", "label_runs"]
+__all__ = ["ORIGINS", "find_differences", "find_origin_differences", "label_runs"]
 
 IGNORED_SETTINGS = {"seed", "seeds", "draw", "steps", "evaluate_every", "evaluation_episodes"}
 """Settings that do not distinguish methods."""
@@ -22,6 +22,7 @@ ORIGINS: Mapping[str, Callable[[Config], str]] = {
     "version of JAX": lambda config: config.versions["jax"],
     "machine": lambda config: config.machine,
 }
+"""Functions that return what has trained a run, by its name."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,9 @@ def label_runs(runs: Sequence[Run]) -> dict[str, list[Run]]:
 
     def label(values: Mapping[str, Any]) -> str:
         method, algorithm = values["method"], values["algorithm"]
-        names = [name for name in values if (name, method, algorithm) in distinguishing]
-        return ", ".join([method, *[algorithm] * several_algorithms, *(f"{name} {values[name]}" for name in names)])
+        names = [method, algorithm] if several_algorithms else [method]
+        settings = [f"{name} {values[name]}" for name in values if (name, method, algorithm) in distinguishing]
+        return ", ".join([*names, *settings])
 
     groups = group_pairs((label(values), run) for run, values in zip(runs, settings, strict=True))
     for split in (_split_by_function, _split_by_directory):
@@ -65,21 +67,24 @@ def label_runs(runs: Sequence[Run]) -> dict[str, list[Run]]:
 
 
 def find_differences(runs: Sequence[Run]) -> list[Difference]:
-    """Return the settings, apart from the method, in which runs of one algorithm differ, and differences of latent functions."""
+    """Return the settings, apart from the method, in which runs of an algorithm differ, and differences of latent functions."""
     by_setting = group_pairs(
         ((name, values["algorithm"]), (str(values[name]), values["method"]))
         for values in (effective_settings(run.config.settings) for run in runs)
         for name in values.keys() - _ignored_settings(values) - {"method"}
     )
     differing = group_pairs(
-        (key[0], pair) for key, pairs in by_setting.items() if len(dict(pairs)) > 1 for pair in pairs
+        (name, pair)
+        for (name, _), pairs in by_setting.items()
+        if len({value for value, _ in pairs}) > 1
+        for pair in pairs
     )
     differences = [_make_difference(name, pairs) for name, pairs in sorted(differing.items())]
     return differences + _find_function_differences(runs)
 
 
 def find_origin_differences(runs: Sequence[Run]) -> list[Difference]:
-    """Return the versions and machines, if runs were trained by several."""
+    """Return the versions and the machines that trained the runs, as far as there are several."""
     differences = (
         _make_difference(name, ((get_value(run.config), run.config.settings.method) for run in runs))
         for name, get_value in ORIGINS.items()
@@ -109,8 +114,8 @@ def _find_function_differences(runs: Sequence[Run]) -> list[Difference]:
             (run.config.task.name, method.phi_kind, settings.draw, settings.candidates),
             (_function_name(run), method.name),
         )
-        for run, settings in ((run, run.config.settings) for run in runs)
-        if (method := METHODS.find(settings.method)).needs_phi
+        for run in runs
+        if (method := METHODS.find((settings := run.config.settings).method)).needs_phi
     )
     differences = (_make_difference(f"phi on {task}", pairs) for (task, *_), pairs in pairs_by_draw.items())
     return [difference for difference in differences if len(set(difference.methods.values())) > 1]

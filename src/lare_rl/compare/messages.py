@@ -10,8 +10,8 @@ from lare_rl.util.findings import Finding, render
 
 __all__ = ["MESSAGES", "find_min_p", "find_score_meaning", "find_small_samples", "to_text"]
 
-MIN_CERTAIN_P = 0.05
-"""If p cannot be lower than this, the reader is told."""
+MAX_MIN_P = 0.05
+"""The reader is warned if p cannot be lower than this."""
 
 MESSAGES = {
     # Runs and tables (`collect.py`).
@@ -23,11 +23,7 @@ MESSAGES = {
     "other_task": "{source} is left out: its task is {task}, and that of the runs {tasks}.",
     "other_steps": "{source} has no {metric} of {label} at step {step:,} for every seed: no run is compared there.",
     "differ": "The runs differ in {differences}.",
-    "origin": "Runs: {facts}.",
-    "lare_version": "LaRe {value}",
-    "jax_version": "JAX {value}",
-    "machine": "{value}",
-    "evaluation_episodes": "{value} episodes in each evaluation",
+    "origin": "All runs: {facts}.",
     # Scores.
     "scores": "Scores are {metric} on {task} {when}.",
     "scaled_scores": "Scores are {metric} {when}, scaled linearly between two fixed returns: {scales}.",
@@ -37,8 +33,7 @@ MESSAGES = {
     "at_last_step": "at step {step:,}, the last at which all runs were evaluated",
     "late": "averaged over the evaluations after three quarters of {step:,} steps",
     # Few runs.
-    "few_seeds": "The interval of {count} seeds is their range, which contains the true median in {coverage:.0%} of cases, not in 95%.",
-    "few_draws": "The interval of {count} draws is their range, which contains the true median in {coverage:.0%} of cases, not in 95%.",
+    "few_values": "The interval of {count} {noun} is their range, which contains the true median in {coverage:.0%} of cases, not in 95%.",
     "few_over_tasks": "Intervals of two or three seeds, or draws, are too narrow: they contain the true median in less than 95% of "
     "cases.",
     "min_p": "With these few runs, p is at least {p:.2g}.",
@@ -63,7 +58,7 @@ def to_text(findings: Iterable[Finding]) -> str:
 
 
 def find_score_meaning(comparison: Comparison) -> Finding:
-    """Return what the scores are, at which step."""
+    """Return what the scores are, and at which step."""
     choice = comparison.choice
     when = "late" if choice.average_last_quarter else "at_step" if choice.step is not None else "at_last_step"
     values = {
@@ -77,26 +72,23 @@ def find_score_meaning(comparison: Comparison) -> Finding:
 
 
 def find_small_samples(comparison: Comparison) -> Iterator[Finding]:
-    """Yield which intervals are too narrow.
+    """Report the intervals that are too narrow.
 
     The bootstrap's interval of n = 2 or 3 values is their range: one sample in n^n has the lowest value n times, which is more than
     2.5% of the samples. The range contains the median with probability 1 - 2^(1 - n).
     """
-    samples = {
-        "few_seeds": {row.n_seeds for row in comparison.rows},
-        "few_draws": {row.n_draws for row in comparison.rows},
-    }
-    small_samples = [(code, count) for code, counts in samples.items() for count in sorted(counts & {2, 3})]
+    samples = {"seeds": {row.n_seeds for row in comparison.rows}, "draws": {row.n_draws for row in comparison.rows}}
+    small_samples = [(noun, count) for noun, counts in samples.items() for count in sorted(counts & {2, 3})]
     if comparison.normalised and small_samples:
         yield Finding("few_over_tasks")
         return
-    for code, count in small_samples:
-        yield Finding(code, {"count": count, "coverage": 1 - 2.0 ** (1 - count)})
+    for noun, count in small_samples:
+        yield Finding("few_values", {"noun": noun, "count": count, "coverage": 1 - 2.0 ** (1 - count)})
 
 
 def find_min_p(comparison: Comparison) -> Iterator[Finding]:
-    """Yield the lowest possible p, if it is not low."""
+    """Report the lowest possible p, if it is not low."""
     n_seeds = comparison.rows[0].n_seeds
     n_splits = [math.comb(n_seeds + row.n_seeds, row.n_seeds) for row in comparison.rows if row.p_value is not None]
-    if n_splits and (min_p := 2 * max(n_splits) ** -len(comparison.tasks)) > MIN_CERTAIN_P:
+    if n_splits and (min_p := 2 * max(n_splits) ** -len(comparison.tasks)) > MAX_MIN_P:
         yield Finding("min_p", {"p": min_p})

@@ -5,7 +5,8 @@ from html import escape
 from pathlib import Path
 
 from lare_rl.compare.bootstrap import REPETITIONS, Estimate
-from lare_rl.compare.comparison import Comparison, compare_over_tasks, compare_tasks
+from lare_rl.compare.comparison import Comparison, OverallRow, compare_over_tasks, compare_tasks
+from lare_rl.compare.labels import ORIGINS
 from lare_rl.compare.messages import MESSAGES, find_min_p, find_score_meaning, find_small_samples, to_text
 from lare_rl.compare.results import LearningCurve
 from lare_rl.compare.scores import LAST_RETURN, ScoreChoice
@@ -52,8 +53,7 @@ def comparison_table(comparison: Comparison) -> tuple[tuple[str, ...], list[tupl
     several_draws = any(row.n_draws > 1 for row in comparison.rows)
     rows = [
         (
-            row.label if number else f"{row.label} (baseline)",
-            str(row.n_seeds),
+            *_first_cells(row, number),
             str(row.iqm),
             format_plus_minus(row.mean, row.std),
             *map(_format_cell, (row.difference, row.improvement, row.p_value)),
@@ -65,15 +65,16 @@ def comparison_table(comparison: Comparison) -> tuple[tuple[str, ...], list[tupl
 
 
 def overall_table(comparisons: Sequence[Comparison]) -> list[tuple[str, ...]]:
-    """Return the rows of the table over all tasks, under `OVERALL_HEADER`. It has none if there is nothing to compare."""
+    """Return the rows of the table over all tasks, under `OVERALL_HEADER`. There are none if there is nothing to compare."""
     return [
-        (
-            row.label if number else f"{row.label} (baseline)",
-            str(row.n_seeds),
-            *map(_format_cell, (row.improvement, row.p_value)),
-        )
+        (*_first_cells(row, number), *map(_format_cell, (row.improvement, row.p_value)))
         for number, row in enumerate(compare_over_tasks(comparisons))
     ]
+
+
+def _first_cells(row: OverallRow, number: int) -> tuple[str, str]:
+    """Return the method, with a remark in the first row, and the number of its seeds."""
+    return row.label if number else f"{row.label} (baseline)", str(row.n_seeds)
 
 
 def _format_cell(value: Estimate | float | None) -> str:
@@ -85,13 +86,9 @@ def _format_cell(value: Estimate | float | None) -> str:
 def _find_origin(results: Sequence[LearningCurve]) -> Finding | None:
     """Return the versions, machine and evaluations that all runs share."""
     configs = [result.config for result in results if result.config is not None]
-    values = {
-        "lare_version": {config.lare for config in configs},
-        "jax_version": {config.versions["jax"] for config in configs},
-        "machine": {config.machine for config in configs},
-        "evaluation_episodes": {config.settings.evaluation_episodes for config in configs},
-    }
-    facts = tuple(Finding(code, {"value": min(group)}) for code, group in values.items() if len(group) == 1)
+    values = {name: {get_value(config) for config in configs} for name, get_value in ORIGINS.items()}
+    values["episodes of an evaluation"] = {str(config.settings.evaluation_episodes) for config in configs}
+    facts = tuple(f"{name} {group.pop()}" for name, group in values.items() if len(group) == 1)
     return Finding("origin", {"facts": facts}) if facts else None
 
 

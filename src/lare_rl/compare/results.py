@@ -26,6 +26,7 @@ _Number = TypeVar("_Number", int, float)
 
 MAX_TABLE_BYTES = 1 << 28
 COLUMNS = ("method", "task", "seed", "step")
+"""The columns of a table besides the metric."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def group_pairs(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]
 
 
 def read_run_results(runs: Mapping[str, Sequence[Run]], metric: str) -> list[LearningCurve]:
-    """Read the values of a metric in runs. `runs` maps each label to its runs. Raises `LareError` if a file is damaged."""
+    """Read the curves of a metric in runs, which are grouped by label. Raises `LareError` if a file is damaged."""
     results = []
     for label, run in ((label, run) for label, group in runs.items() for run in group):
         curves: dict[int, dict[int, float]] = {seed: {} for seed in run.seeds}
@@ -64,8 +65,18 @@ def read_run_results(runs: Mapping[str, Sequence[Run]], metric: str) -> list[Lea
                 raise LareError(f"the metrics of {run.directory} have the seed {seed}, which the run does not have")
             if line.get(metric) is not None:
                 curves[seed][line["step"]] = float(line[metric])
-        origin = label, run.directory, run.config.task.name, run.config.settings.draw
-        results += [LearningCurve(*origin, seed, values, run.config) for seed, values in curves.items()]
+        results += [
+            LearningCurve(
+                label=label,
+                source=run.directory,
+                task=run.config.task.name,
+                draw=run.config.settings.draw,
+                seed=seed,
+                values=values,
+                config=run.config,
+            )
+            for seed, values in curves.items()
+        ]
     return results
 
 
@@ -74,7 +85,7 @@ def read_results_table(path: Path, metric: str) -> list[LearningCurve]:
 
     Raises `LareError` if the file cannot be read, a column is missing, or a line is not valid.
     """
-    rows = csv.DictReader(io.StringIO(read_text(path, MAX_TABLE_BYTES), newline=""), restkey="")
+    rows = csv.DictReader(io.StringIO(read_text(path, MAX_TABLE_BYTES)))
     try:
         _check_columns(path, rows.fieldnames or (), metric)
         curves = _read_curves(path, rows, metric)
@@ -82,7 +93,10 @@ def read_results_table(path: Path, metric: str) -> list[LearningCurve]:
         raise LareError(f"{path} is not a CSV table: {error}") from error
     if not curves:
         raise LareError(f"{path} has no row with a value of {metric}")
-    return [LearningCurve(method, path, task, 0, seed, values) for (method, task, seed), values in curves.items()]
+    return [
+        LearningCurve(label=method, source=path, task=task, draw=0, seed=seed, values=values)
+        for (method, task, seed), values in curves.items()
+    ]
 
 
 def _check_columns(path: Path, header: Sequence[str], metric: str) -> None:
@@ -106,7 +120,9 @@ def _read_curves(path: Path, rows: csv.DictReader, metric: str) -> dict[tuple[st
         method, task = row["method"], row["task"]
         if not (method and task):
             raise LareError(f"{where} has no method or no task")
-        seed, step = (_parse(f"{where}: {name}", row[name], _whole, "nonnegative whole") for name in ("seed", "step"))
+        seed, step = (
+            _parse(f"{where}: {name}", row[name], _parse_count, "nonnegative whole") for name in ("seed", "step")
+        )
         curve = curves.setdefault((method, task, seed), {})
         if step in curve:
             raise LareError(f"{where} is a second row of {method} on {task} with seed {seed} at step {step}")
@@ -114,7 +130,7 @@ def _read_curves(path: Path, rows: csv.DictReader, metric: str) -> dict[tuple[st
     return curves
 
 
-def _whole(text: str) -> int:
+def _parse_count(text: str) -> int:
     """Return a whole number of at least 0, which may be written as 1000000.0. Raises `ValueError` for another text."""
     number = int(text) if text.isdecimal() else float(text)
     if number < 0 or number != int(number):

@@ -55,12 +55,12 @@ class LabelScores:
         return self.final_scores.mean(axis=0)
 
 
-_Key = tuple[str, str, int, int]
+_CurveKey = tuple[str, str, int, int]
 """Label, task, draw and seed of a curve."""
 
 
 def group_results(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_RETURN) -> list[LabelScores]:
-    """Group the curves of runs by label: the name of the method in the comparison.
+    """Return the scores of each label: the name of a method in the comparison.
 
     Raises `LareError` if a label lacks a task, draw or seed, or not all results have a value at the chosen step.
     """
@@ -72,7 +72,8 @@ def group_results(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_R
     groups = []
     for label in dict.fromkeys(result.label for result in results):
         group = [curve for curve in curves.values() if curve.label == label]
-        draws, seeds = tuple(sorted({curve.draw for curve in group})), tuple(sorted({curve.seed for curve in group}))
+        draws = tuple(sorted({curve.draw for curve in group}))
+        seeds = tuple(sorted({curve.seed for curve in group}))
         scores = _fill_scores(label, draws, seeds, tasks, steps, curves)
         groups.append(
             LabelScores(
@@ -94,7 +95,7 @@ def _fill_scores(
     seeds: Sequence[int],
     tasks: Sequence[str],
     steps: Sequence[int],
-    curves: Mapping[_Key, LearningCurve],
+    curves: Mapping[_CurveKey, LearningCurve],
 ) -> Float[np.ndarray, "draws seeds tasks steps"]:
     """Return the scores of a label. Raises `LareError` if it lacks a task, draw or seed."""
     scores = np.empty((len(draws), len(seeds), len(tasks), len(steps)))
@@ -134,8 +135,9 @@ def _check_tasks(results: Sequence[LearningCurve], tasks: Sequence[str], metric:
                 )
 
 
-def _index_curves(results: Sequence[LearningCurve], metric: str) -> dict[_Key, LearningCurve]:
-    curves: dict[_Key, LearningCurve] = {}
+def _index_curves(results: Sequence[LearningCurve], metric: str) -> dict[_CurveKey, LearningCurve]:
+    """Return the curves by key. Raise `LareError` if a curve has no value, or two have the same key."""
+    curves: dict[_CurveKey, LearningCurve] = {}
     # A table counts as draw 0. Its method lacks the other draws, so it cannot share a label with runs that have them.
     run_sources = {result.label: result.source for result in reversed(results) if result.draw != 0}
     for result in results:
@@ -156,9 +158,9 @@ def _index_curves(results: Sequence[LearningCurve], metric: str) -> dict[_Key, L
     return curves
 
 
-def _shared_steps(curves: Mapping[_Key, LearningCurve], choice: ScoreChoice) -> list[int]:
-    """Return the steps at which all curves have a value, up to the chosen step."""
-    metric, step, _ = choice
+def _shared_steps(curves: Mapping[_CurveKey, LearningCurve], choice: ScoreChoice) -> list[int]:
+    """Return the steps at which all curves have a value, up to the chosen step. Raise `LareError` if there are none."""
+    metric, step = choice.metric, choice.step
     steps = sorted(set.intersection(*(set(curve.values) for curve in curves.values())))
     if not steps:
         steps_of_seeds = group_pairs(

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lare_rl.envs.load import resolve_task
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, check_count
 from lare_rl.latent.function import LatentFunction, function_from_verdict, normalise_source
 from lare_rl.latent.verify import Check, Steps, Verdict, sample_steps, verify
 from lare_rl.llm import prompts
@@ -24,7 +24,9 @@ class DesignError(LareError):
 
     Attributes:
         recorder: holds all exchanges with the model.
-        status: 1; 2 if the model became unavailable before an attempt passed, and 130 if the user stopped the design.
+        model: the name of the model.
+        status: the exit status of the command line: 1; 2 if the model became unavailable before an attempt passed, and 130 if
+            the user stopped the design.
     """
 
     def __init__(self, message: str, recorder: Recorder, model: str, status: int = 1):
@@ -41,8 +43,8 @@ class Attempt(NamedTuple):
     verdict: Verdict
 
     @property
-    def first_error(self) -> str:
-        """The first error, in one line, or "passes"."""
+    def outcome(self) -> str:
+        """The first error and the number of the others, in one line; "passes" if there is none."""
         lines = self.verdict.errors.splitlines() or ["passes"]
         return lines[0] + (f" (and {len(lines) - 1} more)" if len(lines) > 1 else "")
 
@@ -87,7 +89,7 @@ class Conversation:
         if pre_verification:
             attempts = [self._examine(reply) for reply in replies]
             for number, attempt in enumerate(attempts, start=1):
-                self.on_message(f"candidate {number}: {attempt.first_error}")
+                self.on_message(f"candidate {number}: {attempt.outcome}")
             passing = [attempt.reply for attempt in attempts if attempt.verdict.passed]
         request = prompts.combine(self.task, passing or list(map(prompts.quote, replies)), self.kind)
         return request, self.ask("combine", request)
@@ -96,23 +98,19 @@ class Conversation:
         """Verify a reply, and ask for corrections until one passes. Raises `DesignError` if no attempt has passed."""
         attempt = self._examine(reply)
         for number in range(1, MAX_ATTEMPTS + 1):
-            self.on_message(f"attempt {number}: {attempt.first_error}")
+            self.on_message(f"attempt {number}: {attempt.outcome}")
             if attempt.verdict.passed:
                 return attempt
             if number < MAX_ATTEMPTS:
                 request = prompts.correct(request, attempt.reply, attempt.verdict.errors)
                 attempt = self._examine(self.ask("correct", request))
-        raise self._error(f"none of {MAX_ATTEMPTS} attempts passed; the last one failed: {attempt.first_error}")
+        raise self._error(f"none of {MAX_ATTEMPTS} attempts passed; the last one failed: {attempt.outcome}")
 
     def accept(self, reply: str) -> Attempt:
-        """Accept a reply if it can be read: the ablation without pre-verification.
-
-        Raises:
-            DesignError: the reply cannot be read.
-        """
+        """Accept a reply that can be read: the ablation without pre-verification. Raises `DesignError` if it cannot be read."""
         attempt = self._examine(reply)
         if attempt.verdict.graph is None:
-            raise self._error(f"the reply cannot be read: {attempt.first_error}")
+            raise self._error(f"the reply cannot be read: {attempt.outcome}")
         return attempt._replace(verdict=Verdict((Check("read", True),), attempt.verdict.graph))
 
     def to_function(self, attempt: Attempt) -> LatentFunction:
@@ -132,11 +130,7 @@ class Conversation:
 
 
 def check_recorded(task: TaskSpec, kind: FunctionKind, draw: int, candidates: int) -> None:
-    """Check that the shipped recordings have the replies that a design needs when every candidate passes.
-
-    Raises:
-        LareError: a reply is missing.
-    """
+    """Raise `LareError` if the shipped recordings lack a reply that a design needs when every candidate passes."""
     model, request = recorded_model(task.name, kind, draw), prompts.candidate(task, kind)
     replies = [model.reply(request, number) for number in range(candidates)]
     if candidates > 1:
@@ -150,7 +144,7 @@ def design(
     draw: int = 0,
     candidates: int = N_CANDIDATES,
     pre_verification: bool = True,
-    record: Path | None = None,
+    record: str | Path | None = None,
     on_message: Callable[[str], None] = lambda _: None,
     steps: Steps | None = None,
 ) -> LatentFunction:
@@ -167,8 +161,7 @@ def design(
         model: the language model to ask: an object with `name` and `reply(messages, number)`, or a function from messages to a
             text. Without one, the shipped recordings answer.
         draw: the number of the shipped recording that answers (0 to 4). It is independent of the training seed.
-        candidates: n. With 1 (the paper's ablation without self-prompting), the single candidate is the function and
-            nothing is combined.
+        candidates: n. With 1 (the paper's ablation without self-prompting), nothing is combined.
         pre_verification: without it (the paper's ablation), the first function that can be read is accepted.
         record: the file to which every exchange is written, from the first reply on.
         steps: observations (n, observation size) and actions (n, action size) that functions are tried on if there is no
@@ -181,11 +174,13 @@ def design(
     """
     task = require_role(resolve_task(task))
     check_kind(kind)
-    if not 1 <= candidates <= MAX_CANDIDATES:
-        raise LareError(f"candidates = {candidates}: from 1 to {MAX_CANDIDATES}")
+    candidates = check_count("candidates", candidates)
+    if candidates > MAX_CANDIDATES:
+        raise LareError(f"candidates = {candidates}: at most {MAX_CANDIDATES}")
     model = recorded_model(task.name, kind, draw) if model is None else as_model(model)
     sample_steps(task, steps)  # an environment that does not run is found before a model is paid
-    recorder = Recorder(task.name, kind, getattr(model, "temperature", None), record)
+    path = None if record is None else Path(record)
+    recorder = Recorder(task.name, kind, getattr(model, "temperature", None), path)
     conversation = Conversation(task, kind, model, recorder, on_message, steps)
     try:
         request, reply = conversation.start(candidates, pre_verification)

@@ -7,10 +7,10 @@ from lare_rl.errors import LareError
 from lare_rl.phi.evaluate import compute_nodes, evaluate
 from lare_rl.phi.graph import Graph
 
-__all__ = ["NonFiniteFactorError", "compute_batch", "find_infinity"]
+__all__ = ["NonFiniteFactorError", "compute_batch", "find_nonfinite_operation"]
 
 _CHUNK_NUMBERS = 1 << 22
-"""About how many numbers are computed at a time."""
+"""About how many values of the graph are in memory at a time."""
 
 
 class NonFiniteFactorError(LareError):
@@ -36,13 +36,13 @@ def compute_batch(
     return chunks[0] if len(chunks) == 1 else np.concatenate(chunks)
 
 
-def find_infinity(
+def find_nonfinite_operation(
     graph: Graph,
     factor: int,
     observation: Float[np.ndarray, "batch observation"],
     action: Float[np.ndarray, "batch action"],
 ) -> tuple[str, int] | None:
-    """Return the first operation that makes a factor infinite or NaN on these rows, and its line in the source, or None."""
+    """Return the first operation that makes a factor infinite or NaN on these rows, and its line in the source. None if none does."""
     values = compute_nodes(graph, {"observation": observation, "action": action}, keep=True)
     finite = [bool(np.isfinite(value).all()) for value in values]
     needed = graph.needed_for("factors", factor)

@@ -37,6 +37,7 @@ HEADER_PREFIX = "# lare: "
 """It begins the lines that `save` puts on top of the source."""
 
 _VARIATION_SELECTOR = "\ufe0f"
+_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,7 @@ class LatentFunction:
     def graph(self) -> Graph:
         """The function as a graph of array operations on one row: what is computed, compiled and exported.
 
-        Raises:
-            RefusedError: the source cannot be read. This does not happen to a verified function.
+        Raises `RefusedError` if the source cannot be read, which does not happen to a verified function.
         """
         return read(self.source, *self.sizes)
 
@@ -88,14 +88,9 @@ class LatentFunction:
         return factor_meanings(self.source, self.names)
 
     @property
-    def features_read(self) -> list[dict[str, list[int]]]:
-        """For each factor, the indices of "observation" and "action" that it may depend on."""
-        return self.graph.entries_read("factors")
-
-    @property
     def reads(self) -> list[str]:
-        """`features_read` as texts: "observation[8:10, 13], action[0:6]"."""
-        return [features_text(indices) for indices in self.features_read]
+        """For each factor, the entries that it may depend on: "observation[8:10, 13], action[0:6]"."""
+        return [features_text(indices) for indices in self.graph.entries_read("factors")]
 
     def __call__(self, observation: Any, action: Any) -> Float[np.ndarray, "*batch factors"]:
         """Compute the factors of a batch of steps, or of a single step.
@@ -137,13 +132,13 @@ class LatentFunction:
             raise LareError(f"scored_observation = {short_repr(scored_observation)}: it is before, after or both")
         states = select_states(scored_observation, observation, next_observation)
         arrays = [as_numbers("observation", state) for state in states] + [as_numbers("action", action)]
-        lead = arrays[-1].shape[:-1]
-        if any(not array.ndim or array.shape[:-1] != lead for array in arrays):
+        batch_shape = arrays[-1].shape[:-1]
+        if any(not array.ndim or array.shape[:-1] != batch_shape for array in arrays):
             shapes = " and ".join(str(array.shape) for array in arrays)
             raise LareError(f"observations and actions need the same batch axes: their shapes are {shapes}")
-        *observations, actions = (array.reshape(math.prod(lead), array.shape[-1]) for array in arrays)
+        *observations, actions = (array.reshape(math.prod(batch_shape), array.shape[-1]) for array in arrays)
         factors = [self(array, actions) for array in observations]
-        return np.concatenate(factors, axis=-1).reshape(*lead, self.n_factors(scored_observation))
+        return np.concatenate(factors, axis=-1).reshape(*batch_shape, self.n_factors(scored_observation))
 
     def n_factors(self, scored_observation: ScoredObservation) -> int:
         """Return the number of factors of `step_factors`."""
@@ -160,8 +155,7 @@ class LatentFunction:
     def save(self, path: str | Path) -> None:
         """Write a header and the source to `path` (.py), and all fields to a .json file beside it. Existing files are replaced.
 
-        Raises:
-            LareError: a file cannot be written.
+        Raises `LareError` if a file cannot be written.
         """
         path = python_file(Path(path))
         # An argument of the command line that is not UTF-8 has characters that no file can have.
@@ -177,8 +171,7 @@ class LatentFunction:
         lines = [HEADER_PREFIX + " ".join(line.split()) for line in header]
         texts = {".json": json.dumps(fields, indent=1), ".py": "\n".join([*lines, self.source])}
         for suffix, text in texts.items():
-            data = (redact_key(text) + "\n").encode()
-            write_bytes(path.with_suffix(suffix), data)
+            write_bytes(path.with_suffix(suffix), (redact_key(text) + "\n").encode())
 
 
 def python_file(path: Path) -> Path:
@@ -241,10 +234,7 @@ def source_hash(source: str) -> str:
     return hashlib.sha256(source.encode()).hexdigest()
 
 
-Item = TypeVar("Item")
-
-
-def pair_with_roles(items: Sequence[Item], task: TaskSpec) -> list[tuple[Item, TaskSpec]]:
+def pair_with_roles(items: Sequence[_Item], task: TaskSpec) -> list[tuple[_Item, TaskSpec]]:
     """Pair functions, or their files, with the roles of a task. Raises `LareError` if the numbers of items and roles differ."""
     if len(items) != len(task.roles):
         names = ", ".join(role.name for role in task.roles)
@@ -268,12 +258,13 @@ def check_task(function: LatentFunction, task: TaskSpec) -> None:
 
 
 def features_text(indices: dict[str, list[int]]) -> str:
-    """Write indices as in Python, runs of them as slices: "observation[8:10, 13]". Without indices, write "nothing"."""
+    """Write indices as in Python, consecutive ones as slices: "observation[8:10, 13]". Without indices, write "nothing"."""
     texts = []
     for name, numbers in indices.items():
-        runs = [list(run) for _, run in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
-        bounds = [(run[0][1], run[-1][1] + 1) for run in runs]
-        if numbers:
-            slices = (str(start) if stop == start + 1 else f"{start}:{stop}" for start, stop in bounds)
+        # Consecutive numbers exceed their positions by the same amount.
+        groups = itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])
+        runs = [[number for _, number in group] for _, group in groups]
+        slices = [f"{run[0]}:{run[-1] + 1}" if len(run) > 1 else str(run[0]) for run in runs]
+        if slices:
             texts.append(f"{name}[{', '.join(slices)}]")
     return ", ".join(texts) or "nothing"

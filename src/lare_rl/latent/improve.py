@@ -1,7 +1,6 @@
 """Reflection, an extension of the paper: the model sees how well its factors explain returns, and may improve its function.
 
-The caller passes the function that assesses (`lare_rl.training.reflect`), because no module of this folder has access to
-returns.
+The caller passes the function that assesses (`lare_rl.training.reflect`): no module of this package sees returns.
 """
 
 import math
@@ -37,7 +36,7 @@ def improve(
     model: Model,
     assess: Callable[[LatentFunction], Assessment],
     rounds: int = 1,
-    record: Path | None = None,
+    record: str | Path | None = None,
     on_message: Callable[[str], None] = lambda _: None,
 ) -> LatentFunction:
     """Show the model how well a function explains returns, ask for a better one, and return the one that predicts returns best.
@@ -55,7 +54,8 @@ def improve(
         LareError: `record` cannot be written, or it exists and is not the recording of the function's exchanges.
     """
     exchanges = [Exchange(**exchange) for exchange in function.exchanges]
-    recorder = Recorder(task.name, function.kind, getattr(model, "temperature", None), record, exchanges)
+    path = None if record is None else Path(record)
+    recorder = Recorder(task.name, function.kind, getattr(model, "temperature", None), path, exchanges)
     conversation = Conversation(task, function.kind, model, recorder, on_message)
     try:
         best, assessment = function, assess(function)
@@ -79,9 +79,9 @@ def improve(
         except KeyboardInterrupt:
             on_message(f"reflection {number}: stopped")
             break
-        better = candidate_assessment.r2 > assessment.r2
-        on_message(f"reflection {number}: R² = {candidate_assessment.r2:.3f}, {'kept' if better else 'not better'}")
-        if better:
+        is_better = candidate_assessment.r2 > assessment.r2
+        on_message(f"reflection {number}: R² = {candidate_assessment.r2:.3f}, {'kept' if is_better else 'not better'}")
+        if is_better:
             best, assessment = candidate, candidate_assessment
     return conversation.add_exchanges(best)
 

@@ -89,19 +89,16 @@ def _find_file(path: str | Path) -> Path:
     if not isinstance(path, (str, Path)):
         raise LareError(f"a latent function is read from the path of a file, not from {short_repr(path)}")
     path = Path(path)
-    file = path.with_suffix(".py") if path.suffix == ".json" else path
-    if not file.is_file() and path.is_file():
-        file = path
-    if not file.is_file():
-        raise LareError(f"the function file {file} {'is not a file' if file.exists() else 'does not exist'}")
-    if file.stat().st_size > _MAX_FILE_BYTES:
-        raise LareError(f"the function file {file} is larger than {_MAX_FILE_BYTES >> 20} MB")
-    return file
+    python = path.with_suffix(".py") if path.suffix == ".json" else path
+    for file in (python, path):
+        if file.is_file():
+            return file
+    raise LareError(f"the function file {python} {'is not a file' if python.exists() else 'does not exist'}")
 
 
 def _read_header(file: Path) -> tuple[dict[str, str], str]:
-    """Return what `save` wrote above a source, and the source: of a Python file, or of a model's reply."""
-    text = read_text(file)
+    """Return what `save` wrote above a source, by key, and the source: of a Python file, or of a model's reply."""
+    text = read_text(file, _MAX_FILE_BYTES)
     if file.suffix == ".json":
         try:
             text = parse_reply(text).functions

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from lare_rl.envs.placement import make_host_env
 from lare_rl.envs.play import phi_inputs, play_steps
 from lare_rl.errors import LareError, short_repr
-from lare_rl.latent.factors import compute_batch, find_infinity
+from lare_rl.latent.factors import compute_batch, find_nonfinite_operation
 from lare_rl.llm.prompts import FunctionKind, check_kind
 from lare_rl.phi.graph import Graph
 from lare_rl.phi.limits import MAX_FACTORS, RefusedError
@@ -89,17 +89,17 @@ def verify(source: str, task: TaskSpec, kind: FunctionKind = "factors", steps: S
     except RefusedError as error:
         return Verdict((Check("read", False, str(error)),))
     names = factor_names(source, graph.n_factors)
-    error = _finite_error(graph, names, observation, action, source)
+    error = _find_nonfinite_factor(graph, names, observation, action, source)
     checks = Check("read", True), Check("finite", error is None, error or "")
     advice = () if error else tuple(_advice(graph, names, compute_batch(graph, observation, action)))
     return Verdict(checks, graph, advice)
 
 
-def _finite_error(
+def _find_nonfinite_factor(
     graph: Graph, names: Sequence[str], observation: np.ndarray, action: np.ndarray, source: str
 ) -> str | None:
-    """Return a message about the first factor that is not finite on a batch of steps."""
-    # Random numbers that are reproducible for a source, but that its author cannot know.
+    """Return a message about the first factor that is not finite on some steps, or None."""
+    # Reproducible for a source, but not predictable for its author.
     rng = np.random.default_rng(list(hashlib.sha256(source.encode()).digest()))
     size, total = observation.shape[1], observation.shape[1] + action.shape[1]
     noise = [rng.standard_normal((N_SAMPLE_STEPS, n)).astype(np.float32) for n in (size, total - size)]
@@ -120,7 +120,7 @@ def _finite_error(
             factor = int(bad.any(axis=0).argmax())
             rows = bad[:, factor]
             step = steps[rows][:1]
-            origin = find_infinity(graph, factor, step[:, :size], step[:, size:])
+            origin = find_nonfinite_operation(graph, factor, step[:, :size], step[:, size:])
             line, operation = (f" line {origin[1]}", f" ({origin[0]})") if origin else ("", "")
             return (
                 f"E-FINITE{line}: factor {factor + 1}, {names[factor]!r}, is {factors[rows, factor][0]}{operation} for "
@@ -140,9 +140,9 @@ def _advice(graph: Graph, names: Sequence[str], factors: Float[np.ndarray, "step
         elif not varies[i]:
             yield f"factor {name!r} never varies on the recorded steps"
     standardized = (factors[:, varies] - factors[:, varies].mean(axis=0)) / std[varies]
-    same = np.abs(standardized.T @ standardized) / len(factors) > 0.9999
+    correlations = np.abs(standardized.T @ standardized) / len(factors)
     varying = np.flatnonzero(varies).tolist()
-    for i, j in np.argwhere(np.triu(same, 1)):
+    for i, j in np.argwhere(np.triu(correlations > 0.9999, 1)):
         yield f"factor {names[varying[j]]!r} repeats {names[varying[i]]!r} on the recorded steps"
 
 
@@ -191,28 +191,23 @@ def _random_steps(task_json: str, n_steps: int, seed: int) -> Steps:
     role = TaskSpec.model_validate_json(task_json)
     with contextlib.closing(make_host_env(role)) as env:
         team, rng = env.spec.find_team(role.team), np.random.default_rng(seed)
-        sides = select_states(role.scored_observation, "before", "after")
-        rows_by_side: dict[str, list[list[np.ndarray]]] = {side: [] for side in sides}
-        n_rows, n_played = 0, 0
-        for episode in itertools.count():
-            for timestep, env_action, next_timestep in play_steps(env, None, rng, seed + episode):
+        rows_by_side: list[list[list[np.ndarray]]] = [[] for _ in select_states(role.scored_observation, 0, 1)]
+        n_rows, n_played, episode_seeds = 0, 0, itertools.count(seed)
+        # Episodes are played to their ends, because a function is tried on their last steps too.
+        while n_rows < n_steps and n_played < _MAX_PLAYED_STEPS:
+            steps = play_steps(env, None, rng, next(episode_seeds))
+            for timestep, env_action, next_timestep in itertools.islice(steps, _MAX_PLAYED_STEPS - n_played):
                 acting = slice(None) if role.credit_scope == "state" else timestep.alive[team.agents]
-                for side, rows in rows_by_side.items():
-                    inputs = phi_inputs(
-                        role.credit_scope, team, timestep if side == "before" else next_timestep, env_action
-                    )
+                sides = select_states(role.scored_observation, timestep, next_timestep)
+                for rows, side in zip(rows_by_side, sides, strict=True):
+                    inputs = phi_inputs(role.credit_scope, team, side, env_action)
                     rows.append([array[acting] for array in inputs])
                     n_rows += len(rows[-1][0])
                 n_played += 1
-                if n_played == _MAX_PLAYED_STEPS:
-                    break
-            # A function is tried on the end of an episode too.
-            if n_rows >= n_steps or n_played == _MAX_PLAYED_STEPS:
-                break
     if not n_rows:
         raise LareError(f"no agent of {role.name} acted in {n_played} steps of random actions")
     selected = evenly_spaced(n_rows, n_steps)
-    columns = zip(*itertools.chain(*rows_by_side.values()), strict=True)
+    columns = zip(*itertools.chain(*rows_by_side), strict=True)
     observation, action = (np.concatenate(arrays).astype(np.float32)[selected] for arrays in columns)
     observation.setflags(write=False)
     action.setflags(write=False)

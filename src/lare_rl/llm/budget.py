@@ -36,7 +36,7 @@ class Budget:
     estimated: bool = False
     """Whether bytes were counted as tokens, because a server did not report its tokens."""
 
-    def max_reply_tokens(self, messages: Sequence[Message], min_tokens: int = 1) -> int:
+    def max_reply_tokens(self, messages: Sequence[Message], min_tokens: int) -> int:
         """Return how many tokens the reply to a request may have. Each byte of the request counts as a token.
 
         Raises:
@@ -44,7 +44,7 @@ class Budget:
         """
         if self.requests_used >= self.requests:
             raise BudgetExceededError(f"the budget of {self.requests} requests is spent")
-        self.add_pause(0.0)
+        self.add_pause(0.0)  # raises if the time is over
         used = self.tokens_in + self.tokens_out
         remaining = self.tokens - used - max_request_tokens(messages)
         if remaining < min_tokens:
@@ -55,8 +55,8 @@ class Budget:
 
     @property
     def reply_timeout_s(self) -> float:
-        """The longest time for one reply: 120 s, or an eighth of the time for all replies if that is longer."""
-        return max(_REPLY_TIMEOUT_S, _REPLY_TIMEOUT_FRACTION * self.seconds)
+        """The longest time for the next reply: 120 s, or an eighth of the budget if that is longer, while so much is left."""
+        return min(max(_REPLY_TIMEOUT_S, _REPLY_TIMEOUT_FRACTION * self.seconds), self.seconds_left)
 
     @property
     def seconds_left(self) -> float:
@@ -84,13 +84,16 @@ class Budget:
 
     def timeout_text(self) -> str:
         """Return the longest time for the next reply in words."""
-        timeout_s = min(self.reply_timeout_s, self.seconds_left)
-        return f"{timeout_s:.0f} s at most ({format_for_reader(self.seconds_left, 'seconds')} are left for all)"
+        return (
+            f"{self.reply_timeout_s:.0f} s at most ({format_for_reader(self.seconds_left, 'seconds')} are left for all)"
+        )
 
     def count_reply(self, usage: Any, messages: Sequence[Message], reply_bytes: int) -> None:
-        """Add the tokens of a request and its reply. `usage` is what the server reports. Without it, bytes count as tokens.
+        """Add the tokens of a request and its reply.
 
-        `reply_bytes` is an upper bound on the tokens of the reply.
+        Args:
+            usage: the numbers that the server reports, or anything else. Without them, bytes count as tokens.
+            reply_bytes: an upper bound on the tokens of the reply.
         """
         try:
             tokens_in, tokens_out = int(usage["prompt_tokens"]), int(usage["completion_tokens"])
@@ -103,7 +106,7 @@ class Budget:
         self.tokens_out += tokens_out
 
     def summary(self, prices: tuple[float, float] | None = None) -> str:
-        """Return what was used, in a line. `prices` are those of a million tokens in and out."""
+        """Return what was used, in one line. `prices` are those of a million tokens in, and of a million tokens out."""
         estimated = " (counted as bytes: the server gave no numbers)" if self.estimated else ""
         text = f"{self.requests_used} requests, {self.tokens_in:,} tokens in, {self.tokens_out:,} out{estimated}"
         if prices is not None:

@@ -3,9 +3,9 @@
 The HTTP library depends on the version of OpenAI's client (httpx, or its successor). This module uses only what both share.
 """
 
-import queue
 import threading
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, wait
 from typing import Any
 
 __all__ = [
@@ -79,19 +79,16 @@ def run_in_time(fetch: Callable[[], bytes], timeout_s: float) -> bytes:
     Raises:
         TimeoutError: `fetch` takes longer than `timeout_s`. Its thread then runs on.
     """
-    outcome: queue.SimpleQueue[tuple[bytes, BaseException | None]] = queue.SimpleQueue()
+    answer: Future[bytes] = Future()
 
     def run() -> None:
         try:
-            outcome.put((fetch(), None))
+            answer.set_result(fetch())
         except BaseException as error:
-            outcome.put((b"", error))
+            answer.set_exception(error)
 
-    threading.Thread(target=run, daemon=True).start()
-    try:
-        body, error = outcome.get(timeout=1.1 * timeout_s)  # time-outs of the sockets come first, with better messages
-    except queue.Empty:
-        raise TimeoutError(f"the answer was not complete after {timeout_s:.0f} s") from None
-    if error is not None:
-        raise error
-    return body
+    threading.Thread(target=run, daemon=True).start()  # an executor would wait for it at the end of the program
+    wait([answer], timeout=1.1 * timeout_s)  # time-outs of the sockets come first, with better messages
+    if not answer.done():
+        raise TimeoutError(f"the answer was not complete after {timeout_s:.0f} s")
+    return answer.result()

@@ -31,6 +31,7 @@ def _key_pattern(key: str) -> re.Pattern[str]:
 
 
 def _letter_pattern(letter: str) -> str:
+    r"""Return a pattern of a letter and of its escapes, such as \u0041, \u{41}, \x41 and \101, after up to four backslashes."""
     code = ord(letter)
     escapes = rf"[uU](?:0000)?00(?i:{code:02x})|[uU]\{{?0*(?i:{code:x})\}}|x(?i:{code:02x})|0?{code:o}"
     return rf"\\{{0,4}}(?:{re.escape(letter)}|(?<=\\)(?:{escapes}))"

@@ -1,12 +1,11 @@
 """A live language model behind an OpenAI-compatible endpoint: OpenAI, vLLM, Ollama, llama.cpp, gateways.
 
-    limits       of time and size: see `http_limits`; of requests, tokens and waiting: see `budget`
-    redirects    to another server are refused, because it would receive the request
-    retries      408, 409, 429, 5xx and broken connections, with back-off or after the time that the server names
-    requests     of the strictest kind that the server supports: see `request_forms`
-    the key      see `key`
-
-The module `reply` parses every reply, however its structure was requested.
+limits       of time and size: see `http_limits`; of requests, tokens and waiting: see `budget`
+redirects    to another server are refused, because it would receive the request
+retries      408, 409, 429, 5xx and broken connections, with back-off or after the time that the server names
+requests     of the strictest form that the server supports: see `request_forms`
+replies      are parsed by `reply`, whatever the form of the request
+the key      see `key`
 """
 
 import re
@@ -52,10 +51,11 @@ class ModelError(LareError):
 
 
 class _Failure(NamedTuple):
-    """Why a request has no reply."""
+    """The reason why a request has no reply, and what to do next."""
 
     message: str
     retry: bool
+    """Whether a further attempt may succeed."""
     pause_s: float | None = None
     """The pause that the server asks for before the next attempt."""
     request_changed: bool = False
@@ -108,12 +108,13 @@ class LiveModel:
         """Return a client that limits the time and the size of answers."""
         import openai
 
-        timeout_s = self.budget.reply_timeout_s
         return openai.OpenAI(
             api_key=api_key() or "none",
             base_url=self.base_url,
             max_retries=0,
-            http_client=openai.DefaultHttpxClient(event_hooks={"response": [check_response]}, timeout=timeout_s),
+            http_client=openai.DefaultHttpxClient(
+                event_hooks={"response": [check_response]}, timeout=self.budget.reply_timeout_s
+            ),
             default_headers={"Accept-Encoding": "identity"},  # answers that are not compressed need no unpacking
         )
 
@@ -131,15 +132,16 @@ class LiveModel:
                 result = self._request(messages)
                 if isinstance(result, str):
                     return redact_key(result)
-                attempts += not result.request_changed
                 cause = f"; the last attempt failed: {result.message}"
+                if result.request_changed:
+                    continue
+                attempts += 1
                 if not result.retry or attempts == _MAX_ATTEMPTS:
                     raise ModelError(f"{self.name} did not answer: {result.message}")
-                if not result.request_changed:
-                    pause_s = result.pause_s or 0.5 * 2 ** (attempts - 1)
-                    self.budget.add_pause(pause_s)
-                    self.on_message(f"{self.name}: {result.message}; trying again in {pause_s:.1f} s")
-                    self.sleep(pause_s)
+                pause_s = result.pause_s or 0.5 * 2 ** (attempts - 1)
+                self.budget.add_pause(pause_s)
+                self.on_message(f"{self.name}: {result.message}; trying again in {pause_s:.1f} s")
+                self.sleep(pause_s)
             except BudgetExceededError as error:
                 raise BudgetExceededError(f"{error}{cause}") from None
 
@@ -147,7 +149,6 @@ class LiveModel:
         max_tokens = min(self.forms.reply_tokens, self.budget.max_reply_tokens(messages, MIN_REPLY_TOKENS))
         request = self.forms.request(self.name, messages, max_tokens, self.temperature)
         self.budget.requests_used += 1
-        timeout_s = min(self.budget.reply_timeout_s, self.budget.seconds_left)
         api = self._client.responses if self.forms.api == "responses" else self._client.chat.completions
         create = api.with_streaming_response.create
 
@@ -157,7 +158,7 @@ class LiveModel:
 
         try:
             with self.budget.count_time():
-                body = run_in_time(fetch, timeout_s)
+                body = run_in_time(fetch, self.budget.reply_timeout_s)
         except Exception as error:  # the errors of the HTTP library depend on the client's version
             return self._failure(error.__cause__ or error, messages, max_tokens)
         return self._read_answer(body, messages, max_tokens)

@@ -11,11 +11,11 @@ from typing import Any, Protocol, cast, runtime_checkable
 from lare_rl.errors import LareError, short_repr
 from lare_rl.llm.key import redact_key
 from lare_rl.llm.prompts import FunctionKind, Message
-from lare_rl.llm.recording import RECORDED, RecordedModel, read_recording, shipped_recordings
+from lare_rl.llm.recording import RecordedModel, read_recording, shipped_recordings
 from lare_rl.util.safe_io import read_text
 from lare_rl.util.sanitize import replace_surrogates
 
-__all__ = ["RECORDED", "FunctionModel", "Model", "ModelFunction", "as_model", "recorded_model"]
+__all__ = ["FunctionModel", "Model", "ModelFunction", "as_model", "recorded_model"]
 
 
 @runtime_checkable
@@ -24,7 +24,7 @@ class Model(Protocol):
 
     @property
     def name(self) -> str:
-        """What provenance calls it."""
+        """The name that a function's provenance has."""
         ...
 
     def reply(self, messages: Sequence[Message], number: int) -> str:
@@ -71,10 +71,9 @@ def as_model(model: Any) -> Model:
 
 
 def recorded_model(task: str, kind: FunctionKind, draw: int = 0, path: Path | None = None) -> RecordedModel:
-    """Return a model that answers from a file, or from the shipped recordings of that kind and draw.
+    """Return a model that answers from a file or, without one, from the shipped recordings of that kind and draw.
 
-    Raises:
-        LareError: the file or draw does not exist, or the file is not a recording.
+    Raises `LareError` if the file or draw does not exist, or the file is not a recording.
     """
     if path is None:
         return RecordedModel(shipped_recordings(kind, draw), task)

@@ -18,13 +18,10 @@ __all__ = [
 
 N_CANDIDATES = 5
 """The default number of candidates for a function: n in line 2 of the paper's Algorithm 1."""
-
 MAX_CANDIDATES = 100
 """The largest number of candidates for a function."""
-
 MAX_ATTEMPTS = 5
 """Attempts at a function that passes, the first included."""
-
 _MAX_QUOTE = 20_000
 """Characters of a failed reply that the model sees again."""
 
@@ -50,12 +47,11 @@ def _template(name: str) -> str:
 def candidate(task: TaskSpec, kind: FunctionKind = "factors") -> list[Message]:
     """Return the first request: the role, and the task (the paper's Eq. 2).
 
-    Raises:
-        LareError: a text of the task is not filled in.
+    Raises `LareError` if a text of the task is not filled in.
     """
-    for key in unwritten_texts(task):
+    if keys := unwritten_texts(task):
         raise LareError(
-            f"task {task.name!r}: {key} still says {FILL_IN!r}. Replace it by what a language model must know; a phi of your own "
+            f"task {task.name!r}: {keys[0]} still says {FILL_IN!r}. Replace it by what a language model must know; a phi of your own "
             "(--function) and --method bayes need no texts."
         )
     sections = (("Task", task.description), ("Observation", task.observation), ("Action", task.action))

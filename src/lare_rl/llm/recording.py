@@ -52,8 +52,7 @@ class Recording(CheckedModel):
 def shipped_recordings(kind: RecordingKind, draw: int) -> list[Recording]:
     """Return the recordings of that kind and draw that come with the package, in the order of their tasks' names.
 
-    Raises:
-        LareError: no recording has that draw.
+    Raises `LareError` if no recording has that draw.
     """
     entries = sorted((SHIPPED_RECORDINGS / kind).iterdir(), key=lambda entry: entry.name)
     selected = [entry for entry in entries if entry.name.endswith(f".draw{draw}.json")]
@@ -88,19 +87,16 @@ def read_recording(text: str, name: str) -> Recording:
         raise LareError(f"recording {name}: {error}") from error
 
 
+@dataclass
 class RecordedModel:
     """Answers requests that match a recorded one word for word, and no other requests."""
 
-    def __init__(self, recordings: Sequence[Recording], task: str):
-        """Create a model.
-
-        Args:
-            recordings: the recordings to answer from, in this order.
-            task: the name of the task, for error messages.
-        """
-        self.recordings = recordings
-        self.task = task
-        self.name = RECORDED
+    recordings: Sequence[Recording]
+    """The recordings to answer from, in this order."""
+    task: str
+    """The name of the task, for error messages."""
+    name: str = field(init=False, default=RECORDED)
+    """The name of the model whose reply was the last."""
 
     def reply(self, messages: Sequence[Message], number: int) -> str:
         """Return a recorded reply to a request. See `Model.reply`."""
@@ -142,10 +138,7 @@ class Recorder:
                 check_new_path(self.path)  # before a model is asked and paid
 
     def _is_recorded(self, path: Path) -> bool:
-        """Return whether a file is a recording of the exchanges so far, of the same task and kind.
-
-        They are compared as they are saved: without the API key.
-        """
+        """Return whether a file is a recording of the exchanges so far, of the same task and kind, as they are saved: without the key."""
         try:
             saved = read_recording(read_text(path), str(path))
         except LareError:

@@ -44,8 +44,7 @@ _OBJECT_START = re.compile(r'\{\s*"')
 def parse_reply(text: str) -> Reply:
     """Read a reply: one JSON object, bare, in a fence, or among other words; or else a fenced function.
 
-    Raises:
-        MalformedReplyError: the text is none of these.
+    Raises `MalformedReplyError` if the text is none of these.
     """
     if not text.strip():
         raise MalformedReplyError("the reply is empty")
@@ -84,7 +83,8 @@ def _check_characters(text: str) -> None:
 
 def _find_object(text: str) -> dict[str, Any] | None:
     """Return the last complete object within a text, or else the function in a fenced block."""
-    decoder, incomplete = json.JSONDecoder(strict=False, parse_int=parse_integer), None
+    decoder = json.JSONDecoder(strict=False, parse_int=parse_integer)
+    incomplete = None
     text = _REASONING_END.split(text)[-1]
     starts = [match.start() for match in _OBJECT_START.finditer(text)]
     for start in reversed(starts[-_MAX_STARTS:]):

@@ -61,7 +61,9 @@ class Answer(NamedTuple):
 
     text: str
     usage: Any
+    """The tokens that the server reports, under the names of chat completions. It may be anything."""
     is_cut_off: bool
+    """Whether the limit on tokens ended the text."""
 
 
 @dataclass(frozen=True)
@@ -114,19 +116,18 @@ class RequestForms:
         return self.without_responses() if is_missing else None
 
     def _ask_for_less(self, reason: str, has_temperature: bool) -> "RequestForms | None":
-        too_long = "token" in reason and re.search("large|at most|maximum|context|exceed", reason)
-        is_chat = self.api == "chat"
-        if too_long and self.reply_tokens > MIN_REPLY_TOKENS:
+        """Return the forms without what a refusal names: so many tokens, an option, or a structure. None if nothing is left."""
+        is_too_long = "token" in reason and re.search("large|at most|maximum|context|exceed", reason)
+        if is_too_long and self.reply_tokens > MIN_REPLY_TOKENS:
             return replace(self, reply_tokens=self.reply_tokens // 2)
-        if is_chat and "max_completion_tokens" in reason and len(self.chat_limits) > 1:
-            return replace(self, chat_limits=self.chat_limits[1:])
+        older_limit = replace(self, chat_limits=self.chat_limits[1:]) if len(self.chat_limits) > 1 else None
+        if older_limit and self.api == "chat" and "max_completion_tokens" in reason:
+            return older_limit
         if "temperature" in reason and has_temperature and self.has_temperature:
             return replace(self, has_temperature=False)
         if len(self.forms) > 1:
             return replace(self, forms=self.forms[1:], is_verified=False)
-        if len(self.chat_limits) > 1:
-            return replace(self, chat_limits=self.chat_limits[1:])
-        return None
+        return older_limit
 
     def read_answer(self, body: bytes) -> Answer:
         """Read the body of an answer.
@@ -158,6 +159,6 @@ def _read_response(answer: Any) -> Answer:
     text = "".join(content.get("text") or content.get("refusal") or "" for content in contents)
     is_cut_off = (answer.get("incomplete_details") or {}).get("reason") == "max_output_tokens"
     usage = answer.get("usage")
-    if isinstance(usage, dict):  # under the names of chat completions
+    if isinstance(usage, dict):
         usage = {"prompt_tokens": usage.get("input_tokens"), "completion_tokens": usage.get("output_tokens")}
     return Answer(text, usage, is_cut_off)

@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 N_COLOURS = 4
-"""The number of colours that are told apart, `c0` to `c3` of report.css; other lines are grey."""
+"""The number of colours of lines, `c0` to `c3` of report.css. Further lines are grey."""
 MAX_VISIBLE_STEPS = 100
 """The largest number of steps that a reader can distinguish in a line."""
 MAX_STRIP_COLUMNS = 200
@@ -46,10 +46,11 @@ MAX_STRIP_COLUMNS = 200
 MAX_HOVERS = 60
 """The largest number of positions at which a chart shows its numbers."""
 MAX_LABEL = 24
-"""Characters of the text at the end of a line that a chart has room for."""
+"""The number of characters for which a chart has room at the end of a line."""
 _UNITS = 1000
 """The width and the height of a chart in its own units."""
 _Scale = Callable[[ArrayLike], np.ndarray]
+"""A function from values to units of the chart."""
 _VIRIDIS = np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], float)
 
 
@@ -88,31 +89,31 @@ class Chart:
         """Return the chart as HTML."""
         x = np.concatenate([line.x for line in self.lines])
         start, end = float(x.min()), float(x.max())
-        if start == end:  # a single point stands out inside
+        if start == end:  # a single point is drawn near the right end, not on the left axis
             start, end = 0.0, 1.05 * end or 1.0
         bottom, top = self.limits or self._find_limits()
         y_ticks, x_ticks = _choose_ticks(bottom, top, 3 if self.is_low else 5), _choose_ticks(start, end, 5)
 
-        def across(values: ArrayLike) -> np.ndarray:
+        def scale_x(values: ArrayLike) -> np.ndarray:
             return _to_units(values, start, end)
 
-        def down(values: ArrayLike) -> np.ndarray:
+        def scale_y(values: ArrayLike) -> np.ndarray:
             return _UNITS - _to_units(values, bottom, top)
 
-        shapes = [f'<path class="grid" d="{"".join(f"M0 {y:.0f}h{_UNITS}" for y in down(y_ticks))}"/>']
+        shapes = [f'<path class="grid" d="{"".join(f"M0 {y:.0f}h{_UNITS}" for y in scale_y(y_ticks))}"/>']
         if self.shaded_until > start:
-            shapes.append(f'<rect class="shade" width="{across([self.shaded_until])[0]:.0f}" height="{_UNITS}"/>')
-        shapes += [*self._render_lines(across, down), *self._render_hovers(across)]
-        tick_labels = _label_ticks(y_ticks)
-        texts = self._render_labels(down)
+            shapes.append(f'<rect class="shade" width="{scale_x([self.shaded_until])[0]:.0f}" height="{_UNITS}"/>')
+        shapes += [*self._render_lines(scale_x, scale_y), *self._render_hovers(scale_x)]
+        tick_labels = [f"{tick:,.10g}" for tick in y_ticks]  # more digits would show errors of rounding
+        texts = self._render_labels(scale_y)
         classes = f"chart{' low' if self.is_low else ''}{' labelled' if texts else ''}"
         texts += [
             f'<span class="y" style="top:{y / 10:.1f}%">{label}</span>'
-            for label, y in zip(tick_labels, down(y_ticks), strict=True)
+            for label, y in zip(tick_labels, scale_y(y_ticks), strict=True)
         ]
         texts += [
             f'<span class="x" style="left:{x / 10:.1f}%">{format_for_reader(tick, "steps")}</span>'
-            for tick, x in zip(x_ticks, across(x_ticks), strict=True)
+            for tick, x in zip(x_ticks, scale_x(x_ticks), strict=True)
         ]
         n_label = min(MAX_LABEL, max(len(line.label) for line in self.lines))
         return (
@@ -133,54 +134,57 @@ class Chart:
         low, high = max(float(values.min()), low - size / 2), min(float(values.max()), high + size / 2)
         return low - 0.05 * size, high + 0.05 * size
 
-    def _render_lines(self, across: _Scale, down: _Scale) -> Iterable[str]:
-        for line in self.lines:
+    def _render_lines(self, scale_x: _Scale, scale_y: _Scale) -> Iterable[str]:
+        for line in self.lines:  # all bands come first, so that none covers a line
             if line.band is not None:
                 is_finite = np.isfinite(line.y + line.band)
                 x, y, band = line.x[is_finite], line.y[is_finite], line.band[is_finite]
-                outline = _points(across([*x, *x[::-1]]), down([*(y + band), *(y - band)[::-1]]))
+                outline = _format_points(scale_x([*x, *x[::-1]]), scale_y([*(y + band), *(y - band)[::-1]]))
                 yield f'<polygon class="band {line.style}" points="{outline}"/>'
         for line in self.lines:
             is_finite = np.isfinite(line.y)
-            points, style = _points(across(line.x[is_finite]), down(line.y[is_finite])), line.style
+            points, style = _format_points(scale_x(line.x[is_finite]), scale_y(line.y[is_finite])), line.style
             if is_finite.sum() == 1:  # a line without length, with round ends
                 points, style = f"{points} {points}", f"{style} dot"
             yield f'<polyline class="{style}" points="{points}"/>'
 
-    def _render_labels(self, down: _Scale) -> list[str]:
+    def _render_labels(self, scale_y: _Scale) -> list[str]:
         labelled = [line for line in self.lines if line.label and np.isfinite(line.y).any()]
-        tops = _spread(down([finite(line.y)[-1] for line in labelled]) / 10, self.label_gap)
+        tops = _move_apart(scale_y([finite(line.y)[-1] for line in labelled]) / 10, self.label_gap)
         return [
             f'<span class="label {line.style}" style="top:{y:.1f}%">{escape(line.label)}</span>'
             for line, y in zip(labelled, tops, strict=True)
         ]
 
-    def _render_hovers(self, across: _Scale) -> list[str]:
+    def _render_hovers(self, scale_x: _Scale) -> list[str]:
         step = math.ceil(len(self.hovers) / MAX_HOVERS) or 1
-        chosen = list(self.hovers.items())[::-step][::-1]  # with the last
-        centres = across([x for x, _ in chosen])
+        chosen = list(self.hovers.items())[::-step][::-1]  # counted from the last, so that it has a text
+        centres = scale_x([x for x, _ in chosen])
         edges = np.concatenate([[0], (centres[1:] + centres[:-1]) / 2, [_UNITS]])
         return [
             f'<rect class="hover" x="{x:.0f}" width="{end - x:.0f}" height="{_UNITS}"><title>{escape(text)}</title></rect>'
-            for (_, text), x, end in zip(chosen, edges, edges[1:], strict=False)
+            for (_, text), (x, end) in zip(chosen, pairwise(edges), strict=False)
         ]
 
 
 @dataclass(frozen=True)
 class Bar:
-    """A bar of the length |amount|, to the left if it is negative. The style is a class of report.css: `minus` has another colour."""
+    """A bar of the length |amount|, to the left if it is negative."""
 
     text: str
     name: str
+    """A name in code, behind the text."""
     amount: float
     style: str
+    """A class of report.css, such as `minus` for another colour, or an empty text."""
     hover: str
+    """A text that appears at the bar."""
     note: str = ""
     """A text behind the name."""
 
 
 def draw_legend(entries: Iterable[tuple[str, str]]) -> str:
-    """Draw the meaning of the styles of lines, and of the styles `shade` and `band ...` of areas."""
+    """Draw pairs of a style and its meaning. The styles `shade` and `band ...` are of areas, the others of lines."""
     items = []
     for style, text in entries:
         is_area = style.startswith(("shade", "band"))
@@ -191,7 +195,8 @@ def draw_legend(entries: Iterable[tuple[str, str]]) -> str:
 
 def draw_bars(bars: Sequence[Bar]) -> str:
     """Draw bars below each other, with their amounts as percentages."""
-    low, high = min([0.0, *(bar.amount for bar in bars)]), max([0.0, *(bar.amount for bar in bars)])
+    amounts = [bar.amount for bar in bars]
+    low, high = min(0.0, *amounts), max(0.0, *amounts)
     extent = max(high - low, 1e-9)
     items = []
     for bar in bars:
@@ -211,7 +216,7 @@ def draw_strips(rows: Mapping[str, Float[np.ndarray, "steps agents"]], shared_sc
     """Draw values over the steps of an episode as colours, with a strip for each name and, within it, a row for each agent.
 
     Args:
-        shared_scale: whether a colour means the same in all strips.
+        shared_scale: whether a colour means the same number in all strips.
     """
     chunks = {name: np.array_split(values, min(len(values), MAX_STRIP_COLUMNS)) for name, values in rows.items()}
     pooled = {name: np.stack([chunk.mean(axis=0) for chunk in strip]) for name, strip in chunks.items()}
@@ -222,28 +227,24 @@ def draw_strips(rows: Mapping[str, Float[np.ndarray, "steps agents"]], shared_sc
     strips = []
     for name, values in pooled.items():
         low, high = scales[name]
-        pixels = _colour(values.T, low, high)
+        pixels = _to_colours(values.T, low, high)
         height = 28 if len(pixels) == 1 else 12 * len(pixels)
         text = f"{name}, from {format_number(low)} (dark) to {format_number(high)} (bright)"
-        strips.append(
-            f'<figure class="strip"><figcaption>{escape(text)}</figcaption><img alt="{escape(text)}" style="height:{height}px" '
-            f'src="{_encode_png(Image.fromarray(pixels))}"></figure>'
-        )
+        image = _render_image(Image.fromarray(pixels), text, f' style="height:{height}px"')
+        strips.append(f'<figure class="strip">{image}</figure>')
     return "".join(strips)
 
 
 def draw_points(points: Float[np.ndarray, "points 2"], values: Float[np.ndarray, " points"], text: str) -> str:
-    """Draw points in the colours of their values. The colours leave out the extreme 2% on both sides."""
+    """Draw points in the colours of their values. The lowest 2% have one colour, and the highest 2%."""
     size, radius = 480, 4
     low, high = np.percentile(values, [2, 98])
     positions = radius + (points - points.min(axis=0)) / np.ptp(points, axis=0) * (size - 2 * radius)
     image = Image.new("RGBA", (size, size))
     draw = ImageDraw.Draw(image)
-    for (x, y), colour in zip(positions, _colour(values, low, high), strict=True):
+    for (x, y), colour in zip(positions, _to_colours(values, low, high), strict=True):
         draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=tuple(map(int, colour)))
-    return (
-        f'<figure><figcaption>{escape(text)}</figcaption><img alt="{escape(text)}" src="{_encode_png(image)}"></figure>'
-    )
+    return f"<figure>{_render_image(image, text)}</figure>"
 
 
 def visible_steps(length: int) -> slice:
@@ -252,52 +253,44 @@ def visible_steps(length: int) -> slice:
     return slice(first, min(length, first + MAX_VISIBLE_STEPS))
 
 
-def _colour(values: Float[np.ndarray, "*shape"], low: float, high: float) -> UInt8[np.ndarray, "*shape 3"]:
+def _to_colours(values: Float[np.ndarray, "*shape"], low: float, high: float) -> UInt8[np.ndarray, "*shape 3"]:
     """Return the colours of numbers, from dark at `low` to bright at `high`."""
     position = np.clip((values - low) / max(high - low, 1e-12), 0, 1) * (len(_VIRIDIS) - 1)
     return np.stack([np.interp(position, range(len(_VIRIDIS)), channel) for channel in _VIRIDIS.T], -1).astype(np.uint8)
 
 
-def _encode_png(image: Image.Image) -> str:
-    """Return the address of an image that holds its data."""
+def _render_image(image: Image.Image, text: str, style: str = "") -> str:
+    """Return an image with its text, as a PNG of 64 colours."""
     file = io.BytesIO()
     image.quantize(64, Image.Quantize.FASTOCTREE).save(file, "PNG", optimize=True)
-    return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
+    data = base64.b64encode(file.getvalue()).decode()
+    return (
+        f'<figcaption>{escape(text)}</figcaption><img alt="{escape(text)}"{style} src="data:image/png;base64,{data}">'
+    )
 
 
 def _to_units(values: ArrayLike, low: float, high: float) -> np.ndarray:
     return np.clip((np.asarray(values, float) - low) / max(high - low, 1e-12) * _UNITS, -_UNITS, 2 * _UNITS)
 
 
-def _points(x: np.ndarray, y: np.ndarray) -> str:
+def _format_points(x: np.ndarray, y: np.ndarray) -> str:
     return " ".join(f"{a:.0f},{b:.0f}" for a, b in zip(x, y, strict=True))
 
 
 def _choose_ticks(low: float, high: float, n_ticks: int) -> list[float]:
-    """Return round numbers between two others."""
+    """Return about `n_ticks` round numbers between two numbers."""
     raw = max(high - low, 1e-12) / n_ticks
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(factor * power for factor in (1, 2, 2.5, 5, 10) if factor * power >= raw * 0.999)
     return [float(step * i) for i in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)] or [low]
 
 
-def _label_ticks(ticks: Sequence[float]) -> list[str]:
-    """Write ticks with as many digits as they need, up to 8."""
-    texts = [list(map(format_number, ticks)), *([f"{tick:,.{n}g}" for tick in ticks] for n in range(4, 9))]
-    tolerance = 0.001 * (ticks[-1] - ticks[0])
-    return next((row for row in texts if _max_error(row, ticks) <= tolerance), texts[0])
-
-
-def _max_error(texts: Sequence[str], numbers: Sequence[float]) -> float:
-    return max(abs(float(text.replace(",", "")) - number) for text, number in zip(texts, numbers, strict=True))
-
-
-def _spread(positions: Float[np.ndarray, " labels"], gap: float) -> list[float]:
-    """Return positions of labels, moved apart where they would overlap."""
+def _move_apart(positions: Float[np.ndarray, " labels"], gap: float) -> list[float]:
+    """Return the positions of labels (percent of the height), moved apart where they would overlap."""
     moved, order = positions.copy(), positions.argsort(kind="stable")
     for _ in range(50):
         for i, j in pairwise(order):
-            overlap = max(0.0, gap - (moved[j] - moved[i])) / 2
-            moved[[i, j]] += -overlap, overlap
+            shift = max(0.0, gap - (moved[j] - moved[i])) / 2
+            moved[[i, j]] += -shift, shift
         moved += max(0.0, -moved.min(initial=0)) - max(0.0, moved.max(initial=0) - 100)
     return moved.tolist()

@@ -1,10 +1,11 @@
 """The diagnosis of a run: whether it learned, whether its proxy rewards explain the score, and what to do next.
 
-A rule looks at the summary of a run and returns a finding or None. Rules stand in groups, and each group reports the finding of its
-first rule that has one. The sentences are in `messages.py`.
+A rule is a function from the summary of a run to a finding or None, named by its finding or subject. Rules stand in groups, and each
+group reports the finding of its first rule that has one. The sentences are in `messages.py`.
 """
 
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -14,17 +15,7 @@ from lare_rl.report.run_summary import MIN_EVALUATIONS, MIN_SEEDS, RunSummary
 from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import CLEAR_ERRORS, sample_std
 
-__all__ = ["CREDIT_CODES", "NEXT_CODES", "diagnose"]
-
-CREDIT_CODES = (
-    "explained", "decoder_is_outdated", "score_use", "trust_nothing", "trust_part", "trust_sums", "single_steps", "steps_agree",
-)  # fmt: skip
-"""Findings about the quality of the credit."""
-NEXT_CODES = (
-    "explains_little", "try_closed_form", "is_rising", "one_seed_was_better", "has_fallen", "is_stuck", "needs_training",
-    "needs_baseline",
-)  # fmt: skip
-"""Findings that recommend what to do next."""
+__all__ = ["Subject", "diagnose"]
 
 CLOSE_CORRELATION = 0.99
 """Proxy and true rewards of steps agree if their correlation is higher."""
@@ -41,17 +32,19 @@ FALL_FRACTION = 0.15
 BETTER_FRACTION = 0.1
 """The best evaluation is mentioned if it exceeds the last one by more than this fraction of the final improvement."""
 
-Rule = Callable[[RunSummary], Finding | None]
+Subject = Literal["outcome", "credit", "next"]
+"""What a finding is about: what the run reached, the quality of its credit, or what to do next."""
+_Rule = Callable[[RunSummary], Finding | None]
 
 
-def diagnose(run: RunSummary) -> list[Finding]:
-    """Return the findings about a run, the most important first."""
+def diagnose(run: RunSummary) -> list[tuple[Subject, Finding]]:
+    """Return the findings about a run and their subjects, the most important first."""
     if finding := _first_finding(_FATAL_RULES, run):
-        return [finding]
-    return [finding for rules in _RULES if (finding := _first_finding(rules, run))]
+        return [("outcome", finding)]
+    return [(subject, finding) for subject, rules in _RULES if (finding := _first_finding(rules, run))]
 
 
-def _first_finding(rules: Sequence[Rule], run: RunSummary) -> Finding | None:
+def _first_finding(rules: Sequence[_Rule], run: RunSummary) -> Finding | None:
     return next((finding for rule in rules if (finding := rule(run))), None)
 
 
@@ -65,8 +58,8 @@ def _untrained(run: RunSummary) -> Finding | None:
 
 def _equal_returns(run: RunSummary) -> Finding | None:
     returns = np.concatenate([run.returns[np.isfinite(run.returns)], run.random_returns])
-    equal = len(run.random_returns) > 1 and np.ptp(returns) == 0
-    return Finding("equal_returns", {"return_": run.final_return}) if equal else None
+    are_equal = len(run.random_returns) and np.ptp(returns) == 0
+    return Finding("equal_returns", {"return_": run.final_return}) if are_equal else None
 
 
 def _outcome(run: RunSummary) -> Finding:
@@ -108,7 +101,7 @@ def _deterministic(run: RunSummary) -> Finding | None:
 
 
 def _episodic_comparison(run: RunSummary) -> Finding | None:
-    """Compare with training on the return of the episode alone, whose standard error is taken to be as large."""
+    """Compare with training on the return of the episode alone. The two returns count as equally uncertain."""
     if run.episodic is None:
         return None
     return_, n_seeds, name = run.episodic
@@ -123,22 +116,22 @@ def _proxy_rewards(run: RunSummary) -> Finding | None:
     """Report how much of the score the proxy rewards explain."""
     if run.return_r2 is None:
         return None
-    outdated = run.return_r2 < LITTLE_R2 and not run.explains_little
-    r2 = run.median_r2 if outdated and run.median_r2 is not None else run.return_r2
+    is_outdated = run.return_r2 < LITTLE_R2 and not run.explains_little
+    r2 = run.median_r2 if is_outdated and run.median_r2 is not None else run.return_r2
     inputs = "raw_features" if not run.sees_factors else "all_inputs" if run.sees_raw_features else "factors"
     values = {
         "inputs": Finding(inputs),
         "amount": Finding("little" if r2 < LITTLE_R2 else "nearly_all" if r2 > HIGH_R2 else "a_part"),
         "r2": r2,
     }
-    if outdated:
+    if is_outdated:
         return Finding("decoder_is_outdated", values | {"last_r2": run.return_r2})
     return Finding("explained", values)
 
 
 def _worse_than_mean(run: RunSummary) -> Finding | None:
-    bad = run.return_r2 is not None and run.return_r2 < BAD_R2
-    return Finding("worse_than_mean", {"r2": run.return_r2}) if bad else None
+    is_bad = run.return_r2 is not None and run.return_r2 < BAD_R2
+    return Finding("worse_than_mean", {"r2": run.return_r2}) if is_bad else None
 
 
 def _score_use(run: RunSummary) -> Finding | None:
@@ -209,15 +202,14 @@ def _is_stuck(run: RunSummary) -> Finding | None:
     if run.n_saturated:
         seeds = Finding("saturated_seeds", {"n_saturated": run.n_saturated, "n_seeds": run.n_seeds})
         return Finding("is_stuck", {"cause": Finding("saturated", {"seeds": seeds if run.n_seeds > 1 else None})})
-    ranges = np.ptp(run.returns[:, -MIN_EVALUATIONS:], axis=1)
-    # A return that is unknown makes the range NaN, and nothing is said.
+    ranges = np.ptp(run.returns[:, -MIN_EVALUATIONS:], axis=1)  # NaN, which is not small, if a return is unknown
     if len(run.steps) < MIN_EVALUATIONS or not np.all(ranges < STUCK_FRACTION * sample_std(run.random_returns)):
         return None
     return Finding("is_stuck", {"cause": Finding("repeats_behaviour", {"n_evaluations": MIN_EVALUATIONS})})
 
 
 def _needs_training(run: RunSummary) -> Finding | None:
-    """Recommend more training to a policy that has not learned, and say if credit is not what limits it."""
+    """Recommend more training for a policy that has not learned, and say if credit is not what limits it."""
     if not len(run.random_returns) or run.has_learned:
         return None
     values: dict[str, Finding | None] = {"limit": None, "evaluate": None, "phi": None}
@@ -246,16 +238,19 @@ def _single_seed(run: RunSummary) -> Finding | None:
     return Finding("single_seed") if run.n_seeds == 1 else None
 
 
-_FATAL_RULES: tuple[Rule, ...] = (_no_return, _untrained, _equal_returns)
+_FATAL_RULES: tuple[_Rule, ...] = (_no_return, _untrained, _equal_returns)
 """Rules whose finding stands alone."""
-_RULES: tuple[tuple[Rule, ...], ...] = (
-    (_outcome,),
-    (_episodic_comparison,),
-    (_proxy_rewards,),
-    (_worse_than_mean,),
-    (_score_use,),
-    (_single_steps,),
-    (_explains_little, _is_rising, _one_seed_was_better, _has_fallen, _is_stuck, _needs_training, _needs_baseline),
-    (_single_seed,),
+_NEXT_RULES: tuple[_Rule, ...] = (
+    _explains_little, _is_rising, _one_seed_was_better, _has_fallen, _is_stuck, _needs_training, _needs_baseline,
+)  # fmt: skip
+_RULES: tuple[tuple[Subject, tuple[_Rule, ...]], ...] = (
+    ("outcome", (_outcome,)),
+    ("outcome", (_episodic_comparison,)),
+    ("credit", (_proxy_rewards,)),
+    ("outcome", (_worse_than_mean,)),
+    ("credit", (_score_use,)),
+    ("credit", (_single_steps,)),
+    ("next", _NEXT_RULES),
+    ("outcome", (_single_seed,)),
 )
-"""Groups of rules. Each group reports one finding."""
+"""Groups of rules with their subjects. Each group reports one finding."""

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.envs.placement import load_env_spec
@@ -20,6 +21,7 @@ from lare_rl.evaluation.evaluate import (
     play_random,
 )
 from lare_rl.runs.directory import Run
+from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.saved_state import load_actor
 from lare_rl.util.findings import format_for_reader
@@ -33,18 +35,18 @@ def evaluation_lines(
 ) -> Iterator[str]:
     """Play episodes by the policy, by random actions and, for a policy that samples, by the most likely actions. Yield the results.
 
-    The arguments are those of `evaluate_policy`. `make_listener` makes a listener of a number of episodes.
+    The arguments are those of `evaluate_policy`, but `make_listener` takes the number of episodes.
     """
     task, settings = run.config.task, run.config.settings
     start = time.monotonic()
     evaluation = evaluate_policy(run, episodes, best, deterministic, make_listener(episodes))
-    policy_s, n_random = time.monotonic() - start, max(episodes, RANDOM_EPISODES)
+    policy_s = time.monotonic() - start
     is_discrete = load_env_spec(task).discrete
     samples = not (deterministic or ALGORITHMS[settings.algorithm].deterministic_evaluation(is_discrete))
     likeliest = evaluate_policy(run, episodes, best, True, make_listener(episodes)) if samples else None
     best_steps = load_actor(run, best=True)[2].tolist() if best else None
-    seeds = evaluation_seeds(run, episodes)
-    if task.group is not None:  # each equally often, because groups may differ in their returns
+    seeds, n_random = evaluation_seeds(run, episodes), max(episodes, RANDOM_EPISODES)
+    if task.group is not None:  # every seed equally often, because groups may differ in their returns
         n_random = len(seeds) * math.ceil(RANDOM_EPISODES / len(seeds))
     random_episodes = play_random(task, n_random, max(policy_s, RANDOM_PLAY_LIMIT_S), make_listener(n_random), seeds)
     yield from describe_evaluation(run, evaluation, random_episodes, best_steps)
@@ -56,34 +58,6 @@ def evaluation_lines(
         yield from compare_actions(run, evaluation, likeliest)
 
 
-def _describe_returns(run: Run, evaluation: Evaluation, best_steps: Sequence[int] | None) -> Iterator[str]:
-    """Yield the returns of each seed. `best_steps` are the steps of the best policies."""
-    roles, has_many_agents = run.config.task.roles, load_env_spec(run.config.task).n_agents > 1
-    for team_index, role in enumerate(roles):
-        for seed_index, seed in enumerate(run.seeds):
-            returns = evaluation.returns[seed_index, :, team_index]
-            line = f"{role.name}, " if len(roles) > 1 else ""
-            line += f"seed {seed}: return {format_mean_std(returns)} over {format_for_reader(len(returns), 'count episode')}"
-            if best_steps is not None:
-                step = best_steps[seed_index]
-                untrained = ", before its first update" if step <= run.config.settings.warmup else ""
-                line += f" (the policy of step {step:,}{untrained})"
-            if has_many_agents:
-                sums = evaluation.summed_returns[seed_index, :, team_index]
-                line += f"; summed over the agents {format_mean_std(sums)}"
-            yield line
-
-
-def compare_actions(run: Run, sampled: Evaluation, likeliest: Evaluation) -> Iterator[str]:
-    """Say which actions are better, if that is clear. Both evaluations play from the same initial states."""
-    for i, role in enumerate(run.config.task.roles):
-        difference = mean_with_error((likeliest.returns - sampled.returns)[:, :, i])
-        if difference is not None and abs(difference[0]) > CLEAR_ERRORS * difference[1]:
-            better = "better: use `--deterministic` here, and `load_policy(..., deterministic=True)` in Python"
-            verdict = better if difference[0] > 0 else "worse: let the policy sample"
-            yield f"{role.name}: the most likely actions are {verdict} ({format_plus_minus(*difference)})"
-
-
 def describe_evaluation(
     run: Run, evaluation: Evaluation, random_episodes: Sequence[Sequence[Episode]], best_steps: Sequence[int] | None
 ) -> Iterator[str]:
@@ -92,15 +66,13 @@ def describe_evaluation(
     if task.evaluation_environment is not None:
         yield f"in {task.evaluation_environment} (training was in {task.environment}):"
     yield from _describe_returns(run, evaluation, best_steps)
-    roles = task.roles
-    for team_index, (role, episodes) in enumerate(zip(roles, random_episodes, strict=True)):
+    for team_index, (prefix, episodes) in enumerate(zip(_team_prefixes(task), random_episodes, strict=True)):
         if not episodes:
             continue
-        team = f"{role.name}, " if len(roles) > 1 else ""
         returns = np.array([episode.return_ for episode in episodes])
-        yield f"{team}random actions: return {format_mean_std(returns)} over {format_for_reader(len(returns), 'count episode')}"
+        yield f"{prefix}random actions: {_format_returns(returns)}"
         if (difference := gain_over_random(evaluation.returns[:, :, team_index], returns)) is not None:
-            yield f"{team}difference: {format_plus_minus(*difference)} (± is its standard error)"
+            yield f"{prefix}difference: {format_plus_minus(*difference)} (± is its standard error)"
     if (group := task.group) is not None and random_episodes[0]:
         groups = Counter(np.asarray(evaluation.measures[group]).ravel().tolist())
         random_groups = Counter(episode.measures[group] for episode in random_episodes[0])
@@ -112,3 +84,38 @@ def describe_evaluation(
         if random_episodes[0]:
             values = np.array([episode.measures[name] for episode in random_episodes[0]])
             yield f"random actions: {name} {format_mean_std(values)}"
+
+
+def compare_actions(run: Run, sampled: Evaluation, likeliest: Evaluation) -> Iterator[str]:
+    """Say which actions are better, if that is clear. Both evaluations play from the same initial states."""
+    for team_index, role in enumerate(run.config.task.roles):
+        difference = mean_with_error((likeliest.returns - sampled.returns)[:, :, team_index])
+        if difference is not None and abs(difference[0]) > CLEAR_ERRORS * difference[1]:
+            better = "better: use `--deterministic` here, and `load_policy(..., deterministic=True)` in Python"
+            verdict = better if difference[0] > 0 else "worse: let the policy sample"
+            yield f"{role.name}: the most likely actions are {verdict} ({format_plus_minus(*difference)})"
+
+
+def _describe_returns(run: Run, evaluation: Evaluation, best_steps: Sequence[int] | None) -> Iterator[str]:
+    """Yield the returns of each seed. `best_steps` are the steps of the best policies."""
+    has_many_agents = load_env_spec(run.config.task).n_agents > 1
+    for team_index, prefix in enumerate(_team_prefixes(run.config.task)):
+        for seed_index, seed in enumerate(run.seeds):
+            line = f"{prefix}seed {seed}: {_format_returns(evaluation.returns[seed_index, :, team_index])}"
+            if best_steps is not None:
+                step = best_steps[seed_index]
+                untrained = ", before its first update" if step <= run.config.settings.warmup else ""
+                line += f" (the policy of step {step:,}{untrained})"
+            if has_many_agents:
+                sums = evaluation.summed_returns[seed_index, :, team_index]
+                line += f"; summed over the agents {format_mean_std(sums)}"
+            yield line
+
+
+def _team_prefixes(task: TaskSpec) -> list[str]:
+    """Return the beginnings of lines about each team. They are empty for a task without teams."""
+    return [f"{role.name}, " if len(task.roles) > 1 else "" for role in task.roles]
+
+
+def _format_returns(returns: Float[np.ndarray, " episodes"]) -> str:
+    return f"return {format_mean_std(returns)} over {format_for_reader(len(returns), 'count episode')}"

@@ -1,4 +1,4 @@
-"""Figures of Matplotlib as SVG text, for comparisons and documents. The report has charts of its own (`charts.py`)."""
+"""Matplotlib's figures as SVG text, for comparisons and documents. A report has other charts (`charts.py`)."""
 
 import io
 import textwrap
@@ -51,7 +51,7 @@ def to_svg(figure: Figure) -> str:
 
 
 def add_white_background(svg: str) -> str:
-    """Put a figure on white, for a page that may be dark. (A report draws on its own background.)"""
+    """Put a figure of `to_svg`, which is transparent, on white: a page may be dark."""
     tag, end, rest = svg.partition(">")
     return f'{tag}{end}<rect width="100%" height="100%" fill="#ffffff"/>{rest}'
 
@@ -69,7 +69,7 @@ def draw_bands(
     """Draw curves with an interval at every point.
 
     Args:
-        x_is_steps: whether x counts environment steps. If not, y is a fraction of runs that changes at each x, drawn as stairs.
+        x_is_steps: whether x counts environment steps. If not, y is a fraction of runs that jumps at each x, drawn as stairs.
     """
     figure, (axes,) = make_figure()
     draw_bands_on(axes, bands, x_is_steps)
@@ -86,11 +86,7 @@ def draw_bands_on(axes: Axes, bands: Mapping[str, Band], x_is_steps: bool) -> No
         axes.plot(x, y, color=colour, linestyle=line, label=name, drawstyle="default" if x_is_steps else "steps-post")
         axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0, step=None if x_is_steps else "post")
     if x_is_steps:
-        axes.xaxis.set_major_formatter(_format_steps)
-
-
-def _format_steps(x: float, _: Any) -> str:
-    return format_for_reader(x, "steps")
+        axes.xaxis.set_major_formatter(lambda x, _: format_for_reader(x, "steps"))
 
 
 def _add_legend(axes: Axes) -> None:

@@ -1,7 +1,7 @@
 """The parts of an HTML page, and the page itself."""
 
 import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -9,10 +9,12 @@ from pathlib import Path
 from lare_rl.latent.function import LatentFunction
 from lare_rl.util.files import write_bytes
 
-__all__ = ["render_film", "render_fold", "render_function", "render_note", "render_table", "render_tiles", "write_page"]
+__all__ = [
+    "render_figures", "render_film", "render_fold", "render_function", "render_note", "render_table", "render_tiles", "write_page",
+]  # fmt: skip
 
 _EMPTY = ("", "-")
-"""Texts of cells that say nothing."""
+"""Texts of empty cells."""
 _PAGE = """<!doctype html>
 <html lang="en">
 <head>
@@ -30,15 +32,14 @@ _PAGE = """<!doctype html>
 
 
 def write_page(path: Path, title: str, body: str, refresh: int | None = None) -> Path:
-    """Write one self-contained HTML file. A browser reloads it after `refresh` seconds.
+    """Write a self-contained HTML file, and return its path. A browser reloads it after `refresh` seconds.
 
     Raises `LareError` if the file cannot be written. An older file is left unchanged.
     """
     reload = "" if refresh is None else f'<meta http-equiv="refresh" content="{refresh}">\n'
     style = (files("lare_rl.report") / "report.css").read_text(encoding="utf-8")
     page = _PAGE.format(title=escape(title), style=style, body=body, refresh=reload)
-    data = page.encode(errors="backslashreplace")  # a name in the file system need not be UTF-8
-    write_bytes(path, data)
+    write_bytes(path, page.encode(errors="backslashreplace"))  # a name in the file system need not be UTF-8
     return path
 
 
@@ -61,9 +62,18 @@ def render_note(text: str) -> str:
 
 
 def render_fold(title: str, sections: Iterable[str]) -> str:
-    """Return sections under a title that opens them; nothing if they are empty."""
+    """Return sections under a title that opens them, or an empty text without sections."""
     content = "\n".join(filter(None, sections))
     return f"<details><summary>{escape(title)}</summary>\n{content}\n</details>" if content else ""
+
+
+def render_figures(figures: Mapping[str, str]) -> str:
+    """Return charts side by side under their titles, or an empty text without charts."""
+    items = (
+        f'<figure><figcaption class="title">{escape(title)}</figcaption>{chart}</figure>'
+        for title, chart in figures.items()
+    )
+    return f'<div class="figures">{"".join(items)}</div>' if figures else ""
 
 
 def render_tiles(tiles: Iterable[tuple[str, str, str]]) -> str:
@@ -76,7 +86,7 @@ def render_tiles(tiles: Iterable[tuple[str, str, str]]) -> str:
 
 
 def render_film(film: bytes, description: str) -> str:
-    """Return an animated WebP that holds its data."""
+    """Return an animated WebP as an image with a data URL."""
     content = base64.b64encode(film).decode()
     return f'<img class="film" alt="{escape(description)}" src="data:image/webp;base64,{content}">'
 

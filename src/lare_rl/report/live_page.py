@@ -5,6 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from lare_rl.errors import LareError
 from lare_rl.evaluation.evaluate import measure_random_returns
@@ -13,7 +14,7 @@ from lare_rl.report.overview import render_learning_curves, render_verdict, summ
 from lare_rl.report.reported_run import ReportedRun
 from lare_rl.runs.config_file import read_config
 from lare_rl.runs.directory import open_without_functions
-from lare_rl.training.progress import MetricLines
+from lare_rl.training.progress import Listener, MetricLines
 
 __all__ = ["PAGE", "LivePage"]
 
@@ -23,7 +24,7 @@ REFRESH_S = 10
 """Seconds after which a browser reloads the page."""
 
 
-class LivePage:
+class LivePage(Listener):
     """A listener that writes the page. It ignores errors of writing.
 
     Args:
@@ -33,16 +34,13 @@ class LivePage:
 
     def __init__(self, directory: Path, browser: bool = True):
         self._directory, self._browser, self._is_running = directory, browser, False
-        self._random_returns: np.ndarray | None = None
+        self._random_returns: Float[np.ndarray, "teams episodes"] | None = None
 
     def on_start(self, name: str, step: int, steps: int) -> None:
         self._is_running = True
         self._write()
         if self._browser:
             webbrowser.open((self._directory / PAGE).resolve().as_uri())
-
-    def on_step(self, step: int) -> None: ...
-    def on_message(self, message: str) -> None: ...
 
     def on_evaluation(self, metrics: MetricLines) -> None:
         if self._random_returns is None:  # not before the first step, because it may take minutes
@@ -58,8 +56,7 @@ class LivePage:
         with suppress(LareError):
             run = open_without_functions(self._directory)
             task, settings = run.config.task, run.config.settings
-            unknown = np.zeros((len(task.roles), 0))
-            random_returns = unknown if self._random_returns is None else self._random_returns
+            random_returns = np.zeros((len(task.roles), 0)) if self._random_returns is None else self._random_returns
             reported = ReportedRun(settings.method, run)
             title = f"{task.name}: {settings.method}"
             (summary,) = summarise_runs([reported], random_returns)

@@ -92,7 +92,7 @@ MESSAGES = {
     "form_sum": "a sum over the steps",
     "form_mean": "an average over the steps",
     "form_log_odds": "won or lost, by the log odds that steps add",
-    "form_history": "a sum over the steps of functions of entries and of their extremes",
+    "form_history": "a sum over the steps, of functions of their entries and of the extremes so far",
     "form_progress": "the sum of the changes of its expected value",
     "period": ", paid every {period} steps",
     "period_nonzero": ", paid with every reward that is not 0",
@@ -205,8 +205,7 @@ WORDS = {
     "effect": (
         "effect",
         "By how much the reward of a step rises with one standard deviation of the factor. It is curved if the reward does not rise or "
-        "fall evenly: one value may be best. It depends on another factor if the reward rises with one factor only, or more, when the "
-        "other is large.",
+        "fall evenly: one value may be best. It depends on another factor if the reward rises more, or only, when that factor is large.",
     ),
 }
 """The words that a report explains: titles and meanings, by the names of their links."""

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.report.charts import N_COLOURS, Chart, Line, draw_legend
-from lare_rl.report.diagnosis import CREDIT_CODES, NEXT_CODES, diagnose
-from lare_rl.report.html import render_fold, render_note, render_table, render_tiles
+from lare_rl.report.diagnosis import diagnose
+from lare_rl.report.html import render_figures, render_fold, render_note, render_table, render_tiles
 from lare_rl.report.messages import MESSAGES, WORDS
 from lare_rl.report.reported_run import Curve, ReportedRun, finite, mean_over_seeds
 from lare_rl.report.run_summary import MIN_SEEDS, EpisodicRun, RunSummary, summarise_run
@@ -37,6 +37,8 @@ CLEAR_PROBABILITY = 0.9
 """A run is the best if a seed of it ends above a seed of the second with this probability, and each has `MIN_SEEDS`."""
 MAX_RANKED = 5
 """The largest number of runs that the comparing sentence names."""
+MAX_HOVER_LINES = 10
+"""The largest number of lines of a text that appears at a step: the step, and a value of each run."""
 _METRICS = {
     RETURN: "return",
     RETURN_R2: "R² of returns",
@@ -52,7 +54,9 @@ class _Metric(NamedTuple):
     name: str
     title: str
     limits: tuple[float, float] | None = None
-    """The ends of the axis. The lower one is -1 if a value is negative."""
+    """The ends of the axis. They become -1 and 1 if a value is negative."""
+    std_name: str = ""
+    """The metric of its standard deviation over the episodes of an evaluation, if there is one."""
 
 
 def summarise_runs(
@@ -60,11 +64,11 @@ def summarise_runs(
 ) -> list[RunSummary | None]:
     """Return the summary of each run of a task, with the returns of its first team.
 
-    Each is compared with the best run on the return of the episode alone, if there is one. Such runs are not compared.
+    A run is compared with the best of those on the return of the episode alone, which are not compared themselves.
     """
     episodic = None
-    if trained_so := _episodic_runs(runs):
-        best, name = trained_so[0], trained_so[0].name if len(trained_so) > 1 else None
+    if episodic_runs := _episodic_runs(runs):
+        best, name = episodic_runs[0], episodic_runs[0].name if len(episodic_runs) > 1 else None
         episodic = EpisodicRun(best.final_return, len(best.final_values(RETURN)), name)
     return [summarise_run(run, random_returns[0], None if run.is_episodic else episodic) for run in runs]
 
@@ -77,7 +81,7 @@ def _episodic_runs(runs: Sequence[ReportedRun]) -> list[ReportedRun]:
 def render_verdict(
     reported: ReportedRun, summary: RunSummary | None, film: str = "", has_title: bool = True
 ) -> Iterable[str]:
-    """Yield what a run reached: a film, a verdict and the numbers."""
+    """Yield what a run reached: a film, a verdict and numbers."""
     yield f'<div class="hero{" filmed" if film else ""}">{film}<div>'
     if has_title:
         yield f"<h1>{escape(reported.name)} on {escape(reported.run.config.task.name)}</h1>"
@@ -85,19 +89,17 @@ def render_verdict(
         yield f'<p class="headline">{MESSAGES["no_evaluation"]}</p></div></div>'
         return
     yield f'<p class="headline">{escape(render_headline(summary))}</p>'
-    for finding in diagnose(summary):
-        if finding.code not in CREDIT_CODES:
-            class_ = ' class="verdict"' if finding.code in NEXT_CODES else ""
+    for subject, finding in diagnose(summary):
+        if subject != "credit":
+            class_ = ' class="verdict"' if subject == "next" else ""
             yield f"<p{class_}>{render(finding, MESSAGES, 'html')}</p>"
     yield f"{render_tiles(_tiles(reported, summary))}</div></div>"
 
 
 def _tiles(reported: ReportedRun, summary: RunSummary) -> Iterable[tuple[str, str, str]]:
     """Yield the numbers of a run: title, number, remark. Those that are unknown are missing."""
-    for title, values, noun in (
-        ("Return", summary.final_returns, "seed"),
-        ("Random actions", summary.random_returns, "episode"),
-    ):
+    returns = summary.final_returns
+    for title, values, noun in ("Return", returns, "seed"), ("Random actions", summary.random_returns, "episode"):
         number, _, std = _format_spread(values).partition(" ± ")
         if number:
             yield title, number, f"{std and f'± {std}, '}{format_for_reader(len(values), f'count {noun}')}"
@@ -109,19 +111,19 @@ def _tiles(reported: ReportedRun, summary: RunSummary) -> Iterable[tuple[str, st
 
 def render_headline(summary: RunSummary) -> str:
     """Return the verdict in a few words, as text."""
-    finding = diagnose(summary)[0]
+    _, finding = diagnose(summary)[0]
     return render(Finding(f"headline_{finding.code}", finding.values), MESSAGES)
 
 
 def render_trust(summary: RunSummary | None) -> Iterable[str]:
-    """Yield what is known about the quality of a run's credit."""
-    for finding in [] if summary is None else diagnose(summary):
-        if finding.code in CREDIT_CODES:
+    """Yield the findings about the quality of a run's credit."""
+    for subject, finding in [] if summary is None else diagnose(summary):
+        if subject == "credit":
             yield f"<p>{render(finding, MESSAGES, 'html')}</p>"
 
 
 def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
-    """Return the findings that compare the final returns of some runs of a task, which are sorted by them."""
+    """Return the findings that compare the final returns of runs of a task. The runs are sorted by them."""
     finals = {reported.name: values for reported in runs if len(values := reported.final_values(RETURN))}
     if len(finals) < 2:
         return []
@@ -146,12 +148,13 @@ def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
     ]
     findings += _episodic_discounts(runs)
     steps = {reported.last_step for reported in runs if reported.metrics}
-    findings += [Finding("different_steps", {"least": min(steps), "most": max(steps)})] if len(steps) > 1 else []
+    if len(steps) > 1:
+        findings.append(Finding("different_steps", {"least": min(steps), "most": max(steps)}))
     return findings
 
 
 def _episodic_discounts(runs: Sequence[ReportedRun]) -> list[Finding]:
-    """Report the discounts of PPO, if other runs are compared with runs on the return of the episode alone that all have some."""
+    """Report the discounts of PPO, if runs are compared with runs on the return of the episode alone that all discount."""
     episodic = _episodic_runs(runs)
     if not episodic or all(run.is_episodic for run in runs):
         return []
@@ -179,31 +182,27 @@ def render_comparison(task: TaskSpec, runs: Sequence[ReportedRun]) -> Iterable[s
 
 
 def render_final_values(runs: Sequence[ReportedRun]) -> str:
-    """Return a table of the last values: a row for each run or, of a single run, for each seed."""
+    """Return a table of the last values of runs of a task: a row for each run or, of a single run, for each seed."""
     rows = []
     for reported in runs:
-        task = reported.run.config.task.name
         values = [reported.final_values(metric) for metric in _METRICS]
         step, n_seeds = f"{reported.last_step:,}", len(reported.run.seeds)
         if len(runs) > 1:
-            rows.append((task, reported.name, *map(_format_spread, values), str(n_seeds), step))
+            rows.append((reported.name, *map(_format_spread, values), str(n_seeds), step))
         else:
             for i, seed in enumerate(reported.run.seeds):
                 cells = (format_number(numbers[i]) if len(numbers) == n_seeds else "" for numbers in values)
-                rows.append(("", f"seed {seed}", *cells, "", step))
-    if len({row[0] for row in rows}) == 1:
-        rows = [("", *row[1:]) for row in rows]
-    header = ("task", "run", *_METRICS.values(), "seeds", "steps")
-    return render_table(header, rows, numbers=range(2, len(header)))
+                rows.append((f"seed {seed}", *cells, "", step))
+    header = ("run", *_METRICS.values(), "seeds", "steps")
+    return render_table(header, rows, numbers=range(1, len(header)))
 
 
 def render_learning_curves(
     task: TaskSpec, runs: Sequence[ReportedRun], random_returns: Float[np.ndarray, "teams episodes"]
 ) -> Iterable[str]:
     """Yield the curve of the return of each team, and the curves of the other metrics folded below it."""
-    names = [f"{RETURN}_{role.team}" for role in task.teams] or [RETURN]
     colours = {reported.name: f"c{i}" if i < N_COLOURS else "grey" for i, reported in enumerate(sort_runs(runs))}
-    references = [{"random actions": float(returns.mean())} if len(returns) else {} for returns in random_returns]
+    random_means = [float(returns.mean()) if len(returns) else None for returns in random_returns]
     warmups = {reported.run.config.settings.warmup for reported in runs}
     warmup = warmups.pop() if len(warmups) == 1 else 0
     n_episodes = sorted({reported.run.config.settings.evaluation_episodes for reported in runs})
@@ -211,22 +210,22 @@ def render_learning_curves(
         f"A point is the mean of an evaluation of {' or '.join(map(str, n_episodes))} episodes. To quote a final return, play more: "
         "lare-rl evaluate RUN --episodes 100."
     )
-    yield _render_legend(runs, colours, references[0], warmup)
-    for name, role, reference in zip(names, task.roles, references, strict=True):
-        title = f"True return, team of {role.team}" if task.teams else "True return"
-        if chart := _draw_metric(_Metric(name, title), runs, colours, reference, warmup):
-            yield render_note(title) + chart
-    figures = [
-        f'<figure><figcaption class="title">{escape(metric.title)}</figcaption>{chart}</figure>'
+    yield _render_legend(runs, colours, random_means[0] is not None, warmup)
+    returns = _for_teams([_Metric(RETURN, "True return", std_name=RETURN_STD)], task)
+    for metric, random_mean in zip(returns, random_means, strict=True):
+        if chart := _draw_metric(metric, runs, colours, warmup, random_mean):
+            yield render_note(metric.title) + chart
+    charts = {
+        metric.title: chart
         for metric in _other_metrics(task)
-        if (chart := _draw_metric(metric, runs, colours, {}, warmup, label_gap=9.0))
-    ]
+        if (chart := _draw_metric(metric, runs, colours, warmup, label_gap=9.0))
+    }
     if task.name in REFERENCE_RETURNS:
         published = format_number(REFERENCE_RETURNS[task.name].trained)
         yield render_note(
             f"For comparison: TD3 on true rewards reaches about {published} within a million steps, as published."
         )
-    yield render_fold("More curves", ['<div class="figures">', *figures, "</div>"] if figures else ())
+    yield render_fold("More curves", [render_figures(charts)])
 
 
 def _other_metrics(task: TaskSpec) -> Iterable[_Metric]:
@@ -236,12 +235,17 @@ def _other_metrics(task: TaskSpec) -> Iterable[_Metric]:
         _Metric(CREDIT_CORRELATION, "Correlation of proxy and true rewards", (0.0, 1.0)),
         _Metric(CREDIT_ERROR, "Credit error: mean |proxy - true reward|"),
     ]
+    return _for_teams(metrics, task)
+
+
+def _for_teams(metrics: Sequence[_Metric], task: TaskSpec) -> Sequence[_Metric]:
+    """Return the metrics of each team. Those of a task without teams are unchanged."""
     if not task.teams:
         return metrics
     return [
-        metric._replace(name=f"{metric.name}_{role.team}", title=f"{metric.title}, team of {role.team}")
-        for metric in metrics
-        for role in task.teams
+        _Metric(f"{name}_{team}", f"{title}, team of {team}", limits, std_name and f"{std_name}_{team}")
+        for name, title, limits, std_name in metrics
+        for team in (role.team for role in task.teams)
     ]
 
 
@@ -249,30 +253,29 @@ def _draw_metric(
     metric: _Metric,
     runs: Sequence[ReportedRun],
     colours: dict[str, str],
-    references: dict[str, float],
     warmup: int,
+    random_mean: float | None = None,
     label_gap: float = 5.5,
 ) -> str:
-    """Draw a metric of all runs: the mean over seeds and, of few runs, each seed. Return nothing if no run has it."""
+    """Draw a metric of all runs: the mean over seeds and, of few runs, each seed. Return an empty text if no run has it."""
     curves = {reported.name: curve for reported in runs if (curve := reported.curve(metric.name))}
     if not curves:
         return ""
     lines, n_coloured = [], sum(colours[name] != "grey" for name in curves)
-    spreads = {reported.name: reported.curve(RETURN_STD) for reported in runs} if metric.name == RETURN else {}
+    stds = {reported.name: reported.curve(metric.std_name) for reported in runs}
     for name in sorted(curves, key=lambda name: colours[name] == "grey"):
         (steps, values), colour = curves[name], colours[name]
         if len(values) > 1 and len(runs) <= N_COLOURS:
             lines += [Line(steps, row, f"{colour} thin") for row in values]
-        spread = spreads.get(name) if len(values) == 1 and n_coloured == 1 else None
+        std = stds[name] if len(values) == 1 and n_coloured == 1 else None
         label = name if len(runs) > 1 and (colour != "grey" or len(runs) <= 2 * N_COLOURS) else ""
         style = "grey other" if colour == "grey" else colour
-        lines.append(Line(steps, mean_over_seeds(values), style, label, None if spread is None else spread[1][0]))
-    first_step, last_step = (
-        min(steps[0] for steps, _ in curves.values()),
-        max(steps[-1] for steps, _ in curves.values()),
-    )
-    extent = np.array([first_step if first_step < last_step else 0.0, last_step])
-    lines += [Line(extent, np.full(2, value), "grey dashed", name) for name, value in references.items()]
+        band = None if std is None else std[1][0]
+        lines.append(Line(steps, mean_over_seeds(values), style, label=label, band=band))
+    all_steps = np.concatenate([steps for steps, _ in curves.values()])
+    extent = np.array([all_steps.min() if np.ptp(all_steps) else 0.0, all_steps.max()])
+    if random_mean is not None:
+        lines.append(Line(extent, np.full(2, random_mean), "grey dashed", label="random actions"))
     has_negative = any((finite(line.y) < 0).any() for line in lines)
     limits = (-1.0, 1.0) if metric.limits and has_negative else metric.limits
     final = ", ".join(f"{name} {_format_spread(finite(values[:, -1]))}" for name, (_, values) in curves.items())
@@ -294,31 +297,30 @@ def _hovers(curves: dict[str, Curve]) -> dict[float, str]:
         for step, column in zip(steps, values.T, strict=True):
             seeds = f" ({', '.join(map(format_number, column))})" if len(curves) == 1 and len(column) > 1 else ""
             if len(numbers := finite(column)):
-                texts.setdefault(float(step), [f"step {step:,.0f}"]).append(
-                    f"{name}: {format_number(numbers.mean())}{seeds}"
-                )
-    return {step: "\n".join(lines[: 2 + 2 * N_COLOURS]) for step, lines in sorted(texts.items())}
+                lines = texts.setdefault(float(step), [f"step {step:,.0f}"])
+                lines.append(f"{name}: {format_number(numbers.mean())}{seeds}")
+    return {step: "\n".join(lines[:MAX_HOVER_LINES]) for step, lines in sorted(texts.items())}
 
 
-def _render_legend(
-    runs: Sequence[ReportedRun], colours: dict[str, str], references: dict[str, float], warmup: int
-) -> str:
+def _render_legend(runs: Sequence[ReportedRun], colours: dict[str, str], has_random_mean: bool, warmup: int) -> str:
     """Return the meaning of lines, once for all charts."""
-    seeds = max(len(reported.run.seeds) for reported in runs)
+    n_seeds = max(len(reported.run.seeds) for reported in runs)
     entries = [(colour, name) for name, colour in colours.items() if colour != "grey"]
-    n_grey = len(colours) - len(entries)
-    entries += [("grey other", f"{n_grey} with lower returns")] if n_grey else []
-    entries += (
-        [("c0 thin" if len(runs) == 1 else "grey thin", "a seed")] if seeds > 1 and len(runs) <= N_COLOURS else []
-    )
-    if seeds == 1 and len(entries) == 1:
-        entries += [("band c0", "± deviation over the episodes of an evaluation")]
-    entries += [("grey dashed", " / ".join(references))] if references else []
-    return draw_legend(entries + ([("shade", "random steps before the first update")] if warmup else []))
+    if n_grey := len(colours) - len(entries):
+        entries.append(("grey other", f"{n_grey} with lower returns"))
+    if n_seeds > 1 and len(runs) <= N_COLOURS:
+        entries.append(("c0 thin" if len(runs) == 1 else "grey thin", "a seed"))
+    if n_seeds == 1 and len(entries) == 1:
+        entries.append(("band c0", "± deviation over the episodes of an evaluation"))
+    if has_random_mean:
+        entries.append(("grey dashed", "random actions"))
+    if warmup:
+        entries.append(("shade", "random steps before the first update"))
+    return draw_legend(entries)
 
 
 def render_words() -> str:
-    """Return the explanations of words, which links lead to."""
+    """Return the explanations of words, to which links lead."""
     items = (f'<dt id="{code}">{escape(title)}</dt><dd>{escape(text)}</dd>' for code, (title, text) in WORDS.items())
     return f'<h2>Words</h2><dl class="words">{"".join(items)}</dl>'
 

@@ -26,7 +26,7 @@ from lare_rl.report.overview import (
 from lare_rl.report.reported_run import ReportedRun
 from lare_rl.report.run_details import describe_method, render_details, render_settings
 from lare_rl.runs.checkpoint import STATE_FILE
-from lare_rl.runs.directory import Run, find_run_directories, open_run, open_without_functions
+from lare_rl.runs.directory import Run, as_run, find_run_directories, open_run, open_without_functions
 from lare_rl.tasks.trust import untrusted_module
 from lare_rl.util.files import check_new_path
 from lare_rl.util.provenance import code_version
@@ -38,7 +38,7 @@ MAX_TITLE_RUNS = 3
 FILM = "film.webp"
 """The film in a run's directory."""
 MAX_FILMS, MAX_FRAMES, FILM_BYTES = 4, 160, 280_000
-"""The largest numbers of films and of frames of a film, and the bytes of all films together."""
+"""The largest numbers of films of a task and of frames of a film, and of the bytes of all films of a task."""
 
 
 def write_report(
@@ -53,14 +53,15 @@ def write_report(
             directory.
 
     Raises:
-        LareError: a directory has no run, or the file cannot be written.
+        LareError: something is no run, a directory has no run, or the file cannot be written.
     """
-    sources = [runs] if isinstance(runs, (Run, str, Path)) else list(runs)
+    sources = list(runs) if isinstance(runs, Iterable) and not isinstance(runs, str) else [runs]
     if not sources:
         raise LareError("No runs to report. Name one run or more.")
     opened: list[Run] = []
     for source in sources:
-        opened += [source] if isinstance(source, Run) else map(_open_run, find_run_directories([Path(source)]))
+        is_path = isinstance(source, (str, Path))
+        opened += map(_open_run, find_run_directories([Path(source)])) if is_path else [as_run(source)]
     reported_runs = _name_runs(opened)
     path = default_path([run.directory for run in opened]) if out is None else Path(out)
     check_new_path(path, overwrite=True)
@@ -73,7 +74,7 @@ def default_path(directories: Sequence[Path]) -> Path:
 
 
 def _open_run(directory: Path) -> Run:
-    """Open a run, without functions if nothing of it can be loaded. A report imports no untrusted module."""
+    """Open a run, without functions if it has no checkpoint, or its module is untrusted: a report does not import it."""
     run = open_without_functions(directory)
     return open_run(directory) if _can_load(run) else run
 
@@ -93,19 +94,20 @@ def _name_runs(runs: Sequence[Run]) -> list[ReportedRun]:
 
 
 def _title(reported_runs: Sequence[ReportedRun]) -> str:
-    tasks = sorted({reported.run.config.task.name for reported in reported_runs})
-    few = len(reported_runs) <= MAX_TITLE_RUNS
-    names = ", ".join(reported.name for reported in reported_runs) if few else f"{len(reported_runs)} runs"
-    return f"{', '.join(tasks)}: {names}"
+    are_few = len(reported_runs) <= MAX_TITLE_RUNS
+    names = ", ".join(reported.name for reported in reported_runs) if are_few else f"{len(reported_runs)} runs"
+    return f"{', '.join(_task_names(reported_runs))}: {names}"
+
+
+def _task_names(reported_runs: Sequence[ReportedRun]) -> list[str]:
+    return sorted({reported.run.config.task.name for reported in reported_runs})
 
 
 def _render_body(reported_runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
     """Yield all sections, by task: what was reached, learning curves, and the details of each run."""
-    tasks = sorted({reported.run.config.task.name for reported in reported_runs})
-    for task in tasks:
-        yield from _render_task(
-            sort_runs(reported for reported in reported_runs if reported.run.config.task.name == task), film
-        )
+    for task in _task_names(reported_runs):
+        task_runs = [reported for reported in reported_runs if reported.run.config.task.name == task]
+        yield from _render_task(sort_runs(task_runs), film)
     yield from render_settings(reported_runs)
     yield render_words()
     yield render_note(f"Drawn by LaRe {code_version()}.")
@@ -117,35 +119,35 @@ def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
     n_random = max(n_random_episodes(reported.last_step, reported.run.config.longest_episode) for reported in runs)
     random_returns = measure_random_returns(task, n_random)
     summaries = summarise_runs(runs, random_returns)
-    many_agents = any(_can_load(reported.run) for reported in runs) and load_env_spec(task).n_agents > 1
-    all_played = [play_run(reported.run) if many_agents and _can_load(reported.run) else None for reported in runs]
-    filmed = [i for i, reported in enumerate(runs) if film and _can_load(reported.run)][:MAX_FILMS]
-    films = {i: _load_film(runs[i].run, all_played[i], FILM_BYTES // len(filmed)) for i in filmed}
+    loadable = [i for i, reported in enumerate(runs) if _can_load(reported.run)]
+    has_many_agents = bool(loadable) and load_env_spec(task).n_agents > 1
+    episodes = {i: play_run(runs[i].run) for i in loadable if has_many_agents}
+    filmed = loadable[:MAX_FILMS] if film else []
+    films = {i: _load_film(runs[i].run, episodes.get(i), FILM_BYTES // len(filmed)) for i in filmed}
     figures = {i: render_film(data, f"An episode of {runs[i].name}") for i, data in films.items() if data}
     if len(runs) == 1:
         yield from render_verdict(runs[0], summaries[0], figures.get(0, ""))
         yield render_note(describe_method(runs[0].run))
         yield "<h2>Learning</h2>"
         yield from render_learning_curves(task, runs, random_returns)
-        yield from render_details(runs[0].run, render_trust(summaries[0]), all_played[0])
+        yield from render_details(runs[0].run, render_trust(summaries[0]), episodes.get(0))
         yield _note_missing(runs)
         yield render_fold("Final values of each seed", [render_final_values(runs)])
         return
     yield from render_comparison(task, runs)
-    captioned = (
-        f"<figure>{figure}<figcaption>{escape(runs[i].name)}</figcaption></figure>" for i, figure in figures.items()
-    )
-    yield f'<div class="films">{"".join(captioned)}</div>' if figures else ""
+    if figures:
+        yield '<div class="films">'
+        for i, figure in figures.items():
+            yield f"<figure>{figure}<figcaption>{escape(runs[i].name)}</figcaption></figure>"
+        yield "</div>"
     yield from render_learning_curves(task, runs, random_returns)
     yield render_final_values(runs)
     yield "<h2>Each run</h2>"
-    for reported, summary, played in zip(runs, summaries, all_played, strict=True):
-        details = render_details(reported.run, render_trust(summary), played)
+    for i, (reported, summary) in enumerate(zip(runs, summaries, strict=True)):
+        details = render_details(reported.run, render_trust(summary), episodes.get(i))
         title = f"{reported.name}: {render_headline(summary)}" if summary else reported.name
-        yield render_fold(
-            title,
-            [*render_verdict(reported, summary, has_title=False), render_note(describe_method(reported.run)), *details],
-        )
+        verdict = render_verdict(reported, summary, has_title=False)
+        yield render_fold(title, [*verdict, render_note(describe_method(reported.run)), *details])
     yield _note_missing(runs)
 
 
@@ -154,21 +156,18 @@ def _note_missing(runs: Sequence[ReportedRun]) -> str:
     names = [reported.name for reported in runs if not reported.run.has_checkpoint()]
     if not names:
         return ""
-    return render_note(f"Without a checkpoint, there is no film, credit and factors to show: {', '.join(names)}.")
+    return render_note(f"Without a checkpoint, there are no film, credit and factors to show: {', '.join(names)}.")
 
 
 def _can_load(run: Run) -> bool:
+    """Return whether a report may load the checkpoint."""
     return run.has_checkpoint() and untrusted_module(run.config.task) is None
 
 
 def _load_film(run: Run, played: PlayedEpisodes | None, max_bytes: int) -> bytes | None:
     """Return the film in the run's directory, or make one if it is older than the checkpoint. None if nothing can be drawn here."""
-    path = run.directory / FILM
-    if (
-        path.is_file()
-        and path.stat().st_size <= max_bytes
-        and path.stat().st_mtime >= (run.checkpoint / STATE_FILE).stat().st_mtime
-    ):
+    path, written = run.directory / FILM, (run.checkpoint / STATE_FILE).stat().st_mtime
+    if path.is_file() and path.stat().st_size <= max_bytes and path.stat().st_mtime >= written:
         return path.read_bytes()
     try:
         film = encode_film(*record_frames(run, max_frames=MAX_FRAMES, played=played), max_bytes)

@@ -14,7 +14,7 @@ from lare_rl.runs.metric_names import RETURN
 __all__ = ["Curve", "ReportedRun", "finite", "mean_over_seeds"]
 
 Curve = tuple[Float[np.ndarray, " evaluations"], Float[np.ndarray, "seeds evaluations"]]
-"""Steps, and the values that were measured at them."""
+"""The steps of the evaluations, and a metric's values."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,18 @@ class ReportedRun:
         rows = [[values.get((step, seed)) for step in steps] for seed in self.run.seeds]
         return np.array(steps, float), np.array(rows, float)
 
-    def final_values(self, key: str) -> Float[np.ndarray, " seeds"]:
-        """Return the values of a metric at the last evaluation, for the seeds for which it is known."""
+    def values(self, key: str) -> Float[np.ndarray, "seeds evaluations"]:
+        """Return the values of `curve`, without evaluations if the metric was never measured."""
         curve = self.curve(key)
-        return np.zeros(0) if curve is None else finite(curve[1][:, -1])
+        return np.zeros((len(self.run.seeds), 0)) if curve is None else curve[1]
+
+    def final_values(self, key: str) -> Float[np.ndarray, " finite_seeds"]:
+        """Return the finite values of a metric at the last evaluation."""
+        return finite(self.values(key)[:, -1:])
+
+    def last_finite_values(self, key: str) -> Float[np.ndarray, " finite_seeds"]:
+        """Return the finite values of a metric at the last evaluation that has any. Empty if none has."""
+        return next((numbers for column in self.values(key).T[::-1] if len(numbers := finite(column))), np.zeros(0))
 
     @property
     def final_return(self) -> float:
@@ -60,7 +68,7 @@ class ReportedRun:
         return float(returns.mean()) if len(returns) else -math.inf
 
     def training_seconds(self) -> float | None:
-        """Return how long the run has trained, by its rate between evaluations. None if that is unknown."""
+        """Return the time of training (s), by the rates of steps between evaluations. None if one is unknown."""
         rates = {line["step"]: line.get("time/steps_per_second") for line in self.metrics}
         if not rates or not all(rates.values()):
             return None
@@ -68,8 +76,8 @@ class ReportedRun:
         return sum((step - previous) / rates[step] for previous, step in zip([0, *steps], steps, strict=False))
 
 
-def finite(values: np.ndarray) -> Float[np.ndarray, " values"]:
-    """Return the finite ones of some values."""
+def finite(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, " finite_values"]:
+    """Return the finite ones of some values, in one row."""
     return values[np.isfinite(values)]
 
 

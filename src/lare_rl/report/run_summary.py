@@ -1,4 +1,4 @@
-"""The summary of a run that its diagnosis is made from."""
+"""The summary of a run, which its diagnosis reads."""
 
 import math
 from dataclasses import dataclass, field
@@ -60,7 +60,7 @@ class EpisodicRun(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class RunSummary:
-    """What the diagnosis needs to know about a run."""
+    """The numbers of a run that the diagnosis reads."""
 
     steps: Float[np.ndarray, " evaluations"]
     returns: Float[np.ndarray, "seeds evaluations"]
@@ -72,8 +72,8 @@ class RunSummary:
     deterministic_returns: Float[np.ndarray, " seeds"] | None = None
     """The final returns of the most likely actions, or None if the policy does not sample, or they were not measured."""
     episode_error: float = 0.0
-    """The standard error of the mean final return, from episode to episode of the last evaluation. The most likely actions are taken
-    to have the same."""
+    """The standard error of the mean final return, from episode to episode of the last evaluation. That of the most likely actions
+    counts as equal."""
     episodic: EpisodicRun | None = None
     """The run to compare with. None without such a run, and for such a run itself."""
     return_r2: float | None = None
@@ -100,7 +100,7 @@ class RunSummary:
     warmup: int = 0
     """The number of environment steps before the first update."""
     n_saturated: int = 0
-    """The number of seeds whose final policy chooses the same action, at its bounds, in all states."""
+    """The number of seeds whose final policy chooses the same action, with each entry at a bound, in all states."""
     directory: str = "RUN"
     task: str = "TASK"
     """The name of a shipped task, or a placeholder for a task file, which ends in `.toml`."""
@@ -120,12 +120,12 @@ class RunSummary:
 
     @cached_property
     def finite_means(self) -> Float[np.ndarray, " finite_evaluations"]:
-        """The finite ones of `mean_returns`."""
+        """The finite means among `mean_returns`."""
         return finite(self.mean_returns)
 
     @cached_property
     def final_returns(self) -> Float[np.ndarray, " finite_seeds"]:
-        """The seeds' returns at the last evaluation, as far as they are finite."""
+        """The finite returns of seeds at the last evaluation."""
         return finite(self.returns[:, -1])
 
     @property
@@ -139,7 +139,7 @@ class RunSummary:
 
     @property
     def final_difference_error(self) -> float:
-        """The standard error of the difference between the final return and another one with an equal error."""
+        """The standard error of the difference between the final return and another with an equal error."""
         return math.sqrt(2) * self.final_error
 
     @property
@@ -244,10 +244,9 @@ def summarise_run(
         return None
     steps, returns = curve
     deterministic = reported.final_values(DETERMINISTIC_RETURN)
-    _, r2s = reported.curve(RETURN_R2) or (None, np.zeros(0))
+    r2s, lengths = finite(reported.values(RETURN_R2)), reported.values(LENGTH)
     run, task, settings = reported.run, reported.run.config.task, reported.run.config.settings
     method = METHODS.find(settings.method)
-    _, lengths = reported.curve(LENGTH) or (None, np.zeros(0))
     is_initial = steps <= settings.warmup
     initial_returns = returns[:, is_initial].mean(axis=1) if is_initial.any() else np.full(1, np.nan)
     return RunSummary(
@@ -260,7 +259,7 @@ def summarise_run(
         episode_error=_episode_error(reported),
         episodic=episodic,
         return_r2=_last_mean(reported, RETURN_R2),
-        median_r2=float(np.median(finite(r2s))) if len(finite(r2s)) else None,
+        median_r2=float(np.median(r2s)) if len(r2s) else None,
         credit_error=_last_mean(reported, CREDIT_ERROR),
         credit_correlation=_last_mean(reported, CREDIT_CORRELATION),
         score_use=summarise_score_use(
@@ -292,20 +291,17 @@ def _episode_error(reported: ReportedRun) -> float:
     return episode_error(stds**2 * n / max(1, n - 1), n)  # the deviations have n in the denominator
 
 
-def _score_metrics(reported: ReportedRun) -> dict[str, float | None]:
-    """Return the last metrics about the score: means over the seeds, and the standard error of the mean gain."""
-    values = {key: _last_mean(reported, f"credit/{key}") for key in ("average", "log_odds", "gain")}
-    errors = _last_values(reported, "credit/gain_error")
-    return values | {"gain_error": math.sqrt(np.sum(errors**2)) / len(errors) if len(errors) else None}
+def _score_metrics(reported: ReportedRun) -> dict[str, float]:
+    """Return the last metrics about the score, NaN where they are missing: means over the seeds, and the error of the mean gain."""
+    values = {
+        key: reported.last_finite_values(f"credit/{key}") for key in ("average", "log_odds", "gain", "gain_error")
+    }
+    metrics = {key: float(numbers.mean()) if len(numbers) else math.nan for key, numbers in values.items()}
+    errors = values["gain_error"]
+    return metrics | {"gain_error": math.sqrt(np.sum(errors**2)) / len(errors) if len(errors) else math.nan}
 
 
 def _last_mean(reported: ReportedRun, key: str) -> float | None:
     """Return the mean of the last values of a metric, or None if it was never measured."""
-    values = _last_values(reported, key)
+    values = reported.last_finite_values(key)
     return float(values.mean()) if len(values) else None
-
-
-def _last_values(reported: ReportedRun, key: str) -> Float[np.ndarray, " finite_seeds"]:
-    """Return the finite values of a metric at the last evaluation that has any. Empty if none has."""
-    _, values = reported.curve(key) or (None, np.zeros((0, 0)))
-    return next((numbers for column in values.T[::-1] if len(numbers := finite(column))), np.zeros(0))

@@ -12,7 +12,7 @@ from lare_rl.util.statistics import CLEAR_ERRORS
 __all__ = ["CLEAR_GAIN", "ScoreUse", "summarise_score_use"]
 
 CLEAR_GAIN = 0.8
-"""Credit is trusted as a whole if predictions remove more than this share of the baseline's squared error."""
+"""Sums of the credit are trusted if the gain is above this."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,16 +20,20 @@ class ScoreUse:
     """The form in which a method explains the score, and how much better than a mean it predicts returns."""
 
     form: str
-    """The code of a message."""
+    """The code of the message about the form."""
     is_binary: bool = False
     period: int | str | None = None
     """When the environment pays before the end of an episode: the number of steps, or "nonzero"."""
     has_groups: bool = False
+    """Whether each group of episodes has its own intercept."""
     exact: str = "no"
+    """How rewards are made to add up to the return: "no", "last" or "spread"."""
     equal_lengths: bool = False
     """Whether all episodes have the same length, so that a sum and an average are the same."""
     gain: float = math.nan
+    """The share of the baseline's squared error that predictions remove. NaN while too few returns have been predicted."""
     gain_error: float = math.nan
+    """The standard error of the gain."""
 
     @property
     def is_clear(self) -> bool:
@@ -59,24 +63,23 @@ class ScoreUse:
 
 
 def summarise_score_use(
-    method: Method, settings: ResolvedSettings, task: TaskSpec, values: dict[str, float | None], *, equal_lengths: bool
+    method: Method, settings: ResolvedSettings, task: TaskSpec, metrics: dict[str, float], *, equal_lengths: bool
 ) -> ScoreUse | None:
     """Return how a run took the score. None for a method whose rewards do not add up to returns.
 
     Args:
         settings: the settings of the run.
         task: the task of the run.
-        values: the last metrics `average`, `log_odds`, `gain` and `gain_error`, or None where they are missing.
+        metrics: the last `average`, `log_odds`, `gain` and `gain_error`; NaN where they are missing.
         equal_lengths: whether all episodes have the same length.
     """
     if method.fit is None:
         return None
-    gain, error = values["gain"], values["gain_error"]
-    is_average = (values["average"] or 0) > 0.5 or settings.credit.score == "average"
+    is_average = metrics["average"] > 0.5 or settings.credit.score == "average"
     form = "form_mean" if is_average else "form_sum"
     if method.fit is Fit.PREFIX_EVIDENCE:
         form = "form_progress"
-    elif (values["log_odds"] or 0) > 0.5:
+    elif metrics["log_odds"] > 0.5:
         form = "form_log_odds"
     elif method.inputs is not None and "history" in method.inputs.names:
         form = "form_history"
@@ -87,6 +90,6 @@ def summarise_score_use(
         has_groups=task.group is not None,
         exact=settings.credit.exact if settings.credit.exact in ("last", "spread") else "no",
         equal_lengths=equal_lengths,
-        gain=math.nan if gain is None else gain,
-        gain_error=math.nan if error is None else error,
+        gain=metrics["gain"],
+        gain_error=metrics["gain_error"],
     )
