@@ -64,9 +64,9 @@ def test_command(command, tmp_path, file, rollouts):
     [
         ("", ["no rollouts"]),
         ("{}\n[1]\n", ["line 2", "JSON object"]),
-        ('{"a": \n', ["line 1", "not JSON"]),
-        (b"\xff\xfe{}\n", ["line 1", "not JSON"]),
-        ("[" * 100_000, ["line 1", "not JSON"]),
+        ('{"a": \n', ["line 1", "JSON object", "Expecting"]),
+        (b"\xff\xfe{}\n", ["line 1", "JSON object", "decode"]),
+        ("[" * 100_000, ["line 1", "JSON object", "deep"]),
     ],
 )
 def test_bad_files(tmp_path, content, words):

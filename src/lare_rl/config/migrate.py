@@ -36,7 +36,7 @@ def migrate(values: Values) -> Values:
 
 
 def _change_table(name: str, change: Migration) -> Migration:
-    """Return a function that changes one table. In a damaged file the value may be no table; then it stays."""
+    """Return a function that changes one table. What is no table, in a damaged file, stays."""
 
     def migration(values: Values) -> Values:
         table = values.get(name)

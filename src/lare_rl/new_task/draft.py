@@ -126,13 +126,7 @@ def make_draft(
 ) -> Draft:
     """Return the draft of a task file: its lines, and then its texts. Missing texts are marked.
 
-    Args:
-        name: the name of the task.
-        lines: from `head_lines`, and others.
-        texts: by their keys.
-        space_descriptions: sentences by the same keys. A text that does not begin with its sentence gets it as the first line.
-        removed: sentences and table rows that were left out.
-        **fields: further fields of `Draft`.
+    `space_descriptions` are the first lines of texts that do not begin with them. `fields` are further fields of `Draft`.
     """
     missing_keys = tuple(key for key, text in texts.items() if not text)
     lines = list(lines)

@@ -71,15 +71,9 @@ def write_team_drafts(
     removed: tuple[str, ...],
     more_lines: Sequence[str] = (),
 ) -> Draft:
-    """Draft a task file and, if there are several teams, a file for each of them.
+    """Draft a task file with `more_lines` and, if there are several teams, a file for each of them.
 
-    Args:
-        name: the name of the task.
-        environment_id: the key `environment` of all files.
-        env: the environment, made for a task with these teams.
-        texts: by their keys.
-        removed: the lines that were removed from the texts.
-        more_lines: further lines of the task's own file.
+    `env` is the environment, made for a task with these teams. `removed` are the lines that were removed from the texts.
     """
     teams, sizes = env.spec.teams, (env.spec.observation_size, env.spec.action_size)
     task_lines = [*draft.head_lines(name, environment_id, sizes, removed), draft.SCORE_LINE, *more_lines]
