@@ -57,6 +57,9 @@ def test_command(command, tmp_path, file, rollouts):
     ):
         status, _, error = command("turn-credit", source, "--out", target)
         assert (status, error.count("\n"), words in error) == (2, 1, True)
+    status, _, error = command("turn-credit", file, "--out", tmp_path / "new", "--report", tmp_path / "new")
+    assert (status, "another --report" in error) == (2, True)
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(

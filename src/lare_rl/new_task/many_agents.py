@@ -136,7 +136,7 @@ def _team_lines(env: MultiAgentEnv, team: Team) -> list[str]:
 
 def _team_texts(env: MultiAgentEnv, team: Team, texts: Mapping[str, str]) -> dict[str, str]:
     """Return the texts of a team: the lines that do not begin with the name of another team."""
-    other_teams = {other.name for other in env.spec.teams} - {team.name}
+    other_teams = {other.name.lower() for other in env.spec.teams} - {team.name.lower()}
     team_texts = dict(texts)
     for key in TEAM_KEYS:
         lines = texts[key].splitlines()
