@@ -73,7 +73,7 @@ def design(
     model_name = RECORDED if model_name is None else model_name
     is_live = model_name != RECORDED and not model_name.endswith(".json")
     _check_options(is_live, live, draw, reflect, policy, data)
-    out = _check_files(out, record)
+    out = check_function_files(out, record)
     spec = lare_rl.load_task(task) if data is None else read_task(task)
     play, steps = load_playing_policy(policy, spec), load_steps(data, spec)
     path = None if model_name == RECORDED else Path(model_name)
@@ -135,8 +135,11 @@ def _check_options(
             raise LareError(message)
 
 
-def _check_files(out: Path | None, record: Path | None) -> Path | None:
-    """Return the .py file. Raise `LareError` if a file could not be written, before a model is asked and paid."""
+def check_function_files(out: Path | None, record: Path | None = None) -> Path | None:
+    """Return the .py file of `out`, which has a .json beside it. Raise `LareError` if a file cannot be written.
+
+    This comes before a model is asked, and paid.
+    """
     from lare_rl.latent.function import python_file
 
     files = []

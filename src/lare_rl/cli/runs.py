@@ -98,19 +98,17 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = True) -> 
     directories = find_run_directories(runs)
     modules = {untrusted_module(read_config(directory).task) for directory in directories} - {None}
     untrusted = ",".join(sorted(map(str, modules)))
+    remedy = f"set {TRUST_VARIABLE}={untrusted} to allow the import"
     path = out or default_path(directories)
     if untrusted and out is None and path.exists():
         raise LareError(
-            f"the new {path} would have no random play, credit and factors, because {untrusted} is not imported: set "
-            f"{TRUST_VARIABLE}={untrusted} to allow the import, or write another file with --out"
+            f"the new {path} would have no random play, credit and factors, because {untrusted} is not imported: {remedy}, or write "
+            "another file with --out"
         )
     print_progress("drawing, which takes up to a minute for each run")
     print_line(f"wrote {write_report(directories, path, film)}")
     if untrusted:
-        print_progress(
-            f"random play, credit and factors are left out, because {untrusted} was not imported: set {TRUST_VARIABLE}={untrusted} "
-            "to allow the import"
-        )
+        print_progress(f"random play, credit and factors are left out, because {untrusted} was not imported: {remedy}")
 
 
 def export(

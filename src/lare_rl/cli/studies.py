@@ -16,13 +16,8 @@ from lare_rl.errors import LareError
 _BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
 """A directory of the checkout. It does not exist if LaRe was installed from a package index."""
 
-Ray = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="ADDRESS",
-        help="the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).",
-    ),
-]
+_RAY_HELP = "the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray])."
+Ray = Annotated[str | None, tyro.conf.arg(metavar="ADDRESS", help=_RAY_HELP)]
 
 
 def sweep(

@@ -23,22 +23,18 @@ if TYPE_CHECKING:
     from lare_rl.llm.live import LiveModel
     from lare_rl.tasks.spec import TaskSpec
 
-TaskName = Annotated[
-    str, tyro.conf.arg(metavar="TASK", help="a shipped name (see `lare-rl tasks`), or the path of a task file.")
-]
+_TASK_HELP = "a shipped name (see `lare-rl tasks`), or the path of a task file."
+_DATA_HELP = (
+    "logged episodes; functions are checked on their steps instead of random steps of the environment. A directory, a Parquet file, or "
+    "the id of a local Minari data set."
+)
+TaskName = Annotated[str, tyro.conf.arg(metavar="TASK", help=_TASK_HELP)]
 Task = Positional[TaskName]
 RunDirectory = Annotated[Positional[Path], tyro.conf.arg(metavar="RUN")]
 RunDirectories = Annotated[
     Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN", help_behavior_hint="(one or more)")
 ]
-Data = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="DATASET",
-        help="logged episodes; functions are checked on their steps instead of random steps of the environment. A directory, a "
-        "Parquet file, or the id of a local Minari data set.",
-    ),
-]
+Data = Annotated[str | None, tyro.conf.arg(metavar="DATASET", help=_DATA_HELP)]
 Kind = Annotated[FunctionKind, tyro.conf.arg(help="what the function returns: several factors, or one reward.")]
 
 FIRST_PROGRESS_S, PROGRESS_S = 5.0, 20.0

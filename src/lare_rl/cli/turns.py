@@ -6,6 +6,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from lare_rl.cli.design import check_function_files
 from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_messages, print_progress
 from lare_rl.errors import LareError
 from lare_rl.util.files import check_new_path, write_bytes
@@ -96,11 +97,8 @@ def turn_phi(
     if model is None:
         print_messages(turn_request(goal, descriptions, choose_examples(turns)))
         return
+    out = check_function_files(out)
     record = None if out is None else out.with_suffix(".json")
-    if out is not None and out == record:
-        raise LareError(f"{out} is for the model's replies; choose another --out, such as {out.with_suffix('.py')}")
-    for path in filter(None, (out, record)):
-        check_new_path(path, "--out")
     live_model = live.open(model)
     try:
         designed = design_turn_phi(goal, descriptions, turns, live_model, record=record)

@@ -47,7 +47,7 @@ LIMIT_LINE = (
     "more (longer episodes are cut)"
 )
 
-CONTENTS = {
+CONTENTS = {  # what a person must write where a text is missing
     "description": "what is to be solved, and what the goal is; not a word about the reward",
     "observation": "what each entry of the observation means, with its unit; one entry per line (0: speed in m/s)",
     "action": "what each entry of the action means, with its unit; one entry per line",

@@ -20,10 +20,12 @@ from lare_rl.turns.words import MESSAGES, count_decimals
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import CLEAR_ERRORS
 
-__all__ = ["CreditedTurns", "FeatureEffect", "TurnCredit"]
+__all__ = ["EFFECT_KINDS", "CreditedTurns", "FeatureEffect", "TurnCredit"]
 
 MAX_SENTENCES = 8
 """The largest number of features that are described in words."""
+EFFECT_KINDS = {"first": (COUNT, HAPPENED, LAST), "lasting": (COUNT, HAPPENED), "further": (COUNT,)}
+"""For each effect of a feature (see `FeatureEffect`), the kinds of the features of prefixes whose weights add up to it."""
 
 TurnValues = list[Float[np.ndarray, " _"]]
 """One array for each rollout, with one number for each of its turns."""
@@ -187,10 +189,6 @@ class TurnCredit:
             is_logistic=self.logistic,
             reason=reason,
         )
-
-
-EFFECT_KINDS = {"first": (COUNT, HAPPENED, LAST), "lasting": (COUNT, HAPPENED), "further": (COUNT,)}
-"""The kinds of the features of a prefix whose weights add up to an effect."""
 
 
 def _describe_effects(table: TurnTable, prefixes: Prefixes, fit: PrefixFit) -> tuple[FeatureEffect, ...]:

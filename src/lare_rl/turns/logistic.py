@@ -44,14 +44,13 @@ def fit_logistic(
     rate = np.clip(weight @ y / weight.sum(), 0.02, 0.98)
     eta = np.full(len(y), np.log(rate / (1 - rate)))
 
-    def regress(eta: Float[np.ndarray, " prefixes"]) -> GroupSums:
+    def regress(eta: np.ndarray) -> GroupSums:
+        """Return the sums of the regression on the working response."""
         p = logistic(eta)
         curvature = np.maximum(p * (1 - p), MIN_CURVATURE)
         return sum_up(x, eta + (y - p) / curvature, weight * curvature, group, n_rollouts, unit=1.0)
 
-    def newton(
-        eta: Float[np.ndarray, " prefixes"], alpha: Float[np.ndarray, " alphas"], max_steps: int
-    ) -> tuple[Float[np.ndarray, " prefixes"], GroupSums, Elimination]:
+    def newton(eta: np.ndarray, alpha: np.ndarray, max_steps: int) -> tuple[np.ndarray, GroupSums, Elimination]:
         """Return the log odds after Newton's steps, with the sums and the posterior of the last step."""
         sums = regress(eta)
         posterior = eliminate_groups(sums, alpha, 1.0)

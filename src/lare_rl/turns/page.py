@@ -10,7 +10,7 @@ import numpy as np
 
 from lare_rl.report.figures import COLOURS, make_figure, to_svg
 from lare_rl.report.html import render_note, render_table, write_page
-from lare_rl.turns.credit import CreditedTurns
+from lare_rl.turns.credit import EFFECT_KINDS, CreditedTurns
 from lare_rl.turns.messages import Turn, split_turns
 from lare_rl.turns.rollouts import Rollout
 from lare_rl.turns.words import MESSAGES, count_decimals
@@ -151,11 +151,7 @@ def _render_effects(credit: CreditedTurns) -> str:
     """Return the table of effects. The evidence has switched a feature off whose effects are 0 without a deviation."""
     rows, decimals = [], count_decimals(credit.trust.outcome_std)
     for effect in sorted(credit.effects, key=lambda effect: -effect.importance):
-        pairs = (
-            (effect.first, effect.first_std),
-            (effect.lasting, effect.lasting_std),
-            (effect.further, effect.further_std),
-        )
+        pairs = ((getattr(effect, name), getattr(effect, f"{name}_std")) for name in EFFECT_KINDS)
         numbers = (_format_change(*pair, decimals) if round(max(map(abs, pair)), decimals) else "0" for pair in pairs)
         name = effect.name if effect.unit == 1 else f"{effect.name} ({effect.unit:.3g})"
         rows.append((name, f"{effect.frequency:.0%}", *numbers))
