@@ -113,11 +113,6 @@ def test_bad_options_and_outcomes(options, outcomes, words):
         lare_rl.TurnCredit(**options)([{"turns": [{}], "outcome": outcome} for outcome in outcomes])
 
 
-def test_options_may_be_numbers_of_numpy():
-    credit = lare_rl.TurnCredit(np.float32(0.5), window=np.int64(3))
-    assert (credit.lambda_, credit.window) == (0.5, 3)
-
-
 PROGRAM = """
 import sys
 for name in ("jax", "equinox", "torch", "scipy", "gymnasium", "matplotlib"):

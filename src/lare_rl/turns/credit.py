@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
-from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -136,7 +135,7 @@ class TurnCredit:
         Raises:
             LareError: a value is out of its range.
         """
-        if lambda_ is not None and not (isinstance(lambda_, Real) and 0 <= lambda_ <= 1):
+        if lambda_ is not None and not (isinstance(lambda_, int | float) and 0 <= lambda_ <= 1):
             raise LareError(f"lambda_ must be None or a number from 0 to 1, and is {short_repr(lambda_)}")
         self.lambda_, self.window, self.logistic, self.phi = lambda_, check_count("window", window), logistic, phi
         self._errors: tuple[Errors, ...] = ()
