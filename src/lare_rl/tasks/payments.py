@@ -24,9 +24,9 @@ class PaymentRule:
 
     @property
     def for_scores(self) -> "PaymentRule":
-        """The rule for an episode of which only the score is known, which is paid at the end.
+        """The rule for an episode of which only the score is known: it is paid once, at its end.
 
-        A `window` remains only if the environment pays at the end too: else it is that of the payments before.
+        `window` is kept only if the environment pays once, too. Otherwise it is that of earlier payments.
         """
         return PAID_AT_END if self.nonzero or self.period is not None else self
 

@@ -63,14 +63,14 @@ def untrusted_module(task: TaskSpec) -> str | None:
 
 
 def _calls_unknown_function(environment: str) -> bool:
-    """Return whether an environment is PettingZoo's, and made by a function that may do something else."""
+    """Return whether an environment is PettingZoo's, and made by a function that may also do something else."""
     module, function = split_environment(environment)
     is_known = module.partition(".")[0] in _PETTINGZOO_PACKAGES and function == "parallel_env"
     return environment.startswith(PETTINGZOO_PREFIX) and not is_known
 
 
 def check_trusted(task: TaskSpec, directory: Path) -> None:
-    """Raise `LareError` unless the module of a run's environment is installed and calls no unknown function, or is trusted."""
+    """Raise `LareError` unless the user trusts the module of a run's environment, or it is installed and no unknown function is called."""
     module = untrusted_module(task)
     if module is None:
         return
