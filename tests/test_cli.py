@@ -37,6 +37,7 @@ def phi(tmp_path):
         ("train Task --steps 1e5", ["--steps: '1e5'", "whole number"]),
         ("train Task --steps 9 --td3.hidden 8 8,9", ["--td3.hidden: '8,9'", "whole number"]),
         ("train Task --ppo.no-aneal", ["'--ppo.no-anneal'"]),
+        ("train Task --td3 3", ["--td3, 3", "'--td3."]),
         ("train Task --td3.gamma high", ["--td3.gamma: 'high'", "number"]),
         ("train Task --scored-observation=left", ["--scored-observation: 'left'", "before, after, both"]),
         ("", ["--help"]),

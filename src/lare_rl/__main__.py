@@ -6,7 +6,7 @@ from lare_rl.errors import LareError
 
 
 def main() -> None:
-    """Run the command line. It registers plugins while it is imported; their errors are one line, too."""
+    """Run the command line. Its import registers plugins, whose errors are one line too."""
     try:
         from lare_rl import cli
     except LareError as error:

@@ -77,6 +77,18 @@ def nothing():
     return 3
 
 
+class Capitals(Toy):
+    """Hunters hunt.
+
+    # Observation Space
+    Hunter observation: its speed.
+    Prey observation: its distance.
+    """
+
+    def __init__(self, **more):
+        super().__init__(("Hunter_0", "Prey_0"), **more)
+
+
 class OddNames(Toy):
     def __init__(self, **more):
         super().__init__(("red team_0", 'bl"/ue_0', "😀_0"), **more)

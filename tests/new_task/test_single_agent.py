@@ -231,6 +231,12 @@ def test_team_names_that_no_task_may_have(tmp_path):
     assert roles == [("red team", ("red team_[0-9]*",)), ('bl"/ue', ('bl"/ue_[0-9]*',)), ("😀", ("😀_[0-9]*",))]
 
 
+def test_lines_about_other_teams_are_left_out(tmp_path):
+    task = load_with_teams(tmp_path, draft_task("pettingzoo/helpers.parallel_toy_envs:Capitals"))
+    lines = [role.observation.splitlines()[1:] for role in task.roles]
+    assert lines == [["Hunter observation: its speed."], ["Prey observation: its distance."]]
+
+
 def test_documentation_of_a_module():
     draft = draft_task("pettingzoo/pettingzoo.sisl.multiwalker_v9:parallel_env")
     assert draft.missing_keys == ("action",)

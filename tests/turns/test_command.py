@@ -57,6 +57,9 @@ def test_command(command, tmp_path, file, rollouts):
     ):
         status, _, error = command("turn-credit", source, "--out", target)
         assert (status, error.count("\n"), words in error) == (2, 1, True)
+    status, _, error = command("turn-credit", file, "--out", tmp_path / "new", "--report", tmp_path / "new")
+    assert (status, "another --report" in error) == (2, True)
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(
@@ -64,9 +67,9 @@ def test_command(command, tmp_path, file, rollouts):
     [
         ("", ["no rollouts"]),
         ("{}\n[1]\n", ["line 2", "JSON object"]),
-        ('{"a": \n', ["line 1", "not JSON"]),
-        (b"\xff\xfe{}\n", ["line 1", "not JSON"]),
-        ("[" * 100_000, ["line 1", "not JSON"]),
+        ('{"a": \n', ["line 1", "JSON object", "Expecting"]),
+        (b"\xff\xfe{}\n", ["line 1", "JSON object", "decode"]),
+        ("[" * 100_000, ["line 1", "JSON object", "deep"]),
     ],
 )
 def test_bad_files(tmp_path, content, words):
@@ -102,11 +105,7 @@ def test_turn_phi_asks_a_model(monkeypatch, command, tmp_path, file):
     assert command("turn-phi", file, *options)[0] == 0
     assert out.read_text().endswith(PHI)
     assert json.loads(out.with_suffix(".json").read_text())["kind"] == "events"
-    for target, words in (
-        (out, "not overwritten"),
-        (tmp_path / "none" / "a.py", "no directory"),
-        (tmp_path / "new2.json", "new2.py"),
-    ):
+    for target, words in ((out, "not overwritten"), (tmp_path / "none" / "a.py", "no directory")):
         status, _, error = command("turn-phi", file, *options[:-1], target)
         assert (status, words in error) == (2, True)
     assert command("turn-credit", file, "--out", tmp_path / "c.jsonl", "--function", out)[::2] == (0, "")

@@ -58,6 +58,13 @@ def test_results_without_identifier_follow_the_order_of_calls():
         assert [answered.result for answered in turn.calls] == ["a", "b", "c"]
 
 
+def test_results_with_the_same_identifier_follow_the_order_of_calls():
+    """Some servers give all calls the same identifier, such as an empty one."""
+    messages = [assistant("", call("a", identifier=""), call("b", identifier="")), tool("a", ""), tool("b", "")]
+    (turn,) = split_turns(messages, "it")
+    assert [answered.result for answered in turn.calls] == ["a", "b"]
+
+
 @pytest.mark.parametrize("events", [3, {"": 1}, {"event": float("nan")}, {"event": 1e200}, {"event": "y"}])
 def test_results_of_a_phi_are_checked(events):
     with pytest.raises(LareError, match=r"it: .* phi .* turn 0") as error:

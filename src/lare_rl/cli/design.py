@@ -12,6 +12,7 @@ import tyro
 from lare_rl.cli.terminal import (
     DEFAULT_LIVE,
     Data,
+    Kind,
     LiveOptions,
     Task,
     load_playing_policy,
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 def design(
     task: Task,
-    kind: FunctionKind = "factors",
+    kind: Kind = "factors",
     model_name: Annotated[str | None, tyro.conf.arg(name="model", metavar="STR")] = None,
     live: Annotated[LiveOptions, tyro.conf.arg(name="")] = DEFAULT_LIVE,
     draw: int = 0,
@@ -52,8 +53,6 @@ def design(
     that asks for no key, such as Ollama, needs none.
 
     Args:
-        task: a shipped name (see `lare-rl tasks`), or the path of a task file.
-        kind: what the function returns: several factors, or one reward.
         model_name: "recorded" (the shipped recordings, and the default), the path of a recording (.json), or the name of a model
             behind an OpenAI-compatible endpoint.
         live: options of a live model.
@@ -65,8 +64,6 @@ def design(
         policy: a run whose policy plays the episodes for --reflect; without it, actions are random.
         pre_verification: verify and correct the function; without (the paper's ablation), the first reply that can be read is kept.
         record: a file to record every exchange in, for --model FILE; it must not exist, and not be the .json of --out.
-        data: logged episodes; functions are checked on their steps instead of random steps of the environment. A directory, a
-            Parquet file, or the id of a local Minari data set.
         out: a .py file to write, with the replies and checks in a .json beside it; it must not exist.
     """
     import lare_rl
@@ -77,17 +74,17 @@ def design(
     model_name = RECORDED if model_name is None else model_name
     is_live = model_name != RECORDED and not model_name.endswith(".json")
     _check_options(is_live, live, draw, reflect, policy, data)
-    out = _check_files(out, record)
+    out = check_function_files(out, record)
     spec = lare_rl.load_task(task) if data is None else read_task(task)
     play, steps = load_playing_policy(policy, spec), load_steps(data, spec)
     path = None if model_name == RECORDED else Path(model_name)
     model = live.open(model_name) if is_live else recorded_model(spec.name, kind, draw, path)
-    common: dict[str, Any] = {"record": record, "on_message": print_progress}
-    options: dict[str, Any] = {"candidates": candidates, "pre_verification": pre_verification, "steps": steps, **common}
+    outputs: dict[str, Any] = {"record": record, "on_message": print_progress}
+    options: dict[str, Any] = {"candidates": candidates, "pre_verification": pre_verification, "steps": steps}
     with _after_requests(spec, model, live):
-        function = lare_rl.design(spec, kind, model, **options)
+        function = lare_rl.design(spec, kind, model, **options, **outputs)
         if reflect:
-            function = lare_rl.reflect(function, spec, model, reflect, policy=play, **common)
+            function = lare_rl.reflect(function, spec, model, reflect, policy=play, **outputs)
     if out is None:
         _print_function(function, find_free_path(Path(), spec.name, ".py"))
     else:
@@ -96,7 +93,7 @@ def design(
 
 @contextmanager
 def _after_requests(spec: "TaskSpec", model: "Model", live: LiveOptions) -> Iterator[None]:
-    """Keep the replies of a design that fails, because they were paid for. Print what a live model has cost."""
+    """Save the replies of a design that fails, because they were paid for. Print what a live model has cost."""
     from lare_rl.latent.design import DesignError
     from lare_rl.llm.live import LiveModel
 
@@ -126,10 +123,10 @@ def _check_options(
     is_live: bool, live: LiveOptions, draw: int, reflect: int, policy: Path | None, data: str | None
 ) -> None:
     """Raise `LareError` if options do not go together."""
-    live_options = "--base-url, --budget, --requests, --minutes, --price and --temperature"
+    live_options = ", ".join(f"--{name.replace('_', '-')}" for name in LiveOptions.model_fields)
     problems = [
         (is_live and draw != 0, "--draw chooses a recording, and a live model uses none: leave --draw out"),
-        (not is_live and live != DEFAULT_LIVE, f"{live_options} are for a live model: say which one with --model NAME"),
+        (not is_live and live != DEFAULT_LIVE, f"{live_options} are for a live model: name it with --model NAME"),
         (policy and not reflect, "--policy plays the episodes for --reflect: give --reflect a number of rounds"),
         (reflect < 0, f"reflect = {reflect}: the number of rounds cannot be negative"),
         (data and reflect, "--reflect plays episodes, and --data is for tasks without an environment: leave one out"),
@@ -139,8 +136,11 @@ def _check_options(
             raise LareError(message)
 
 
-def _check_files(out: Path | None, record: Path | None) -> Path | None:
-    """Return the .py file. Raise `LareError` if a file could not be written, before a model is asked and paid."""
+def check_function_files(out: Path | None, record: Path | None = None) -> Path | None:
+    """Return the .py file of `out`, which has a .json beside it. Raise `LareError` if a file cannot be written.
+
+    This comes before a model is asked, and paid.
+    """
     from lare_rl.latent.function import python_file
 
     files = []
@@ -157,13 +157,13 @@ def _check_files(out: Path | None, record: Path | None) -> Path | None:
     return out
 
 
-def _save_attempts(error: "DesignError", other: Path) -> None:
-    """Save the replies, which were paid for, in the recorder's file or in another one. If both fail, print them."""
+def _save_attempts(error: "DesignError", new_path: Path) -> None:
+    """Save the replies, which were paid for, in the recorder's file or else in a new one. If both fail, print them."""
     recorder, model = error.recorder, error.model
     recorded = [recorder.path] if recorder.path and recorder.owns_file else []
-    for path in (*recorded, other):
+    for path in (*recorded, new_path):
         try:
-            recorder.save(path, model, new=path not in recorded)
+            recorder.save(path, model, new=path == new_path)
         except LareError as write_error:
             print_error(write_error)
         else:
@@ -172,15 +172,15 @@ def _save_attempts(error: "DesignError", other: Path) -> None:
     print_line(recorder.to_json(model))
 
 
-def _print_function(function: "LatentFunction", other: Path) -> None:
+def _print_function(function: "LatentFunction", new_path: Path) -> None:
     """Print a function. If that fails, save it, because the model's replies were paid for."""
     try:
         print_line(function.source)
     except BrokenPipeError:
         raise
     except OSError as error:
-        function.save(other)
-        raise LareError(f"nothing can be printed ({error.strerror}); the function is kept in {other}") from error
+        function.save(new_path)
+        raise LareError(f"nothing can be printed ({error.strerror}); the function is kept in {new_path}") from error
 
 
 def _save_function(function: "LatentFunction", out: Path, next_command: str) -> None:

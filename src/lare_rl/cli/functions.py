@@ -14,7 +14,9 @@ from tyro.conf import Positional
 from lare_rl.cli.terminal import (
     Data,
     EpisodeProgress,
+    Kind,
     Task,
+    TaskName,
     load_playing_policy,
     load_steps,
     print_line,
@@ -22,12 +24,9 @@ from lare_rl.cli.terminal import (
     print_progress,
 )
 from lare_rl.errors import LareError
-from lare_rl.llm.prompts import FunctionKind
 from lare_rl.tasks.spec import NO_ENVIRONMENT, ScoredObservation
 from lare_rl.util.files import check_new_path, write_bytes
-
-GOOD_R2 = 0.8
-"""From this R² of returns on, factors are worth training with."""
+from lare_rl.util.findings import format_for_reader
 
 if TYPE_CHECKING:
     from lare_rl.envs.play import Episode, Policy
@@ -36,14 +35,12 @@ if TYPE_CHECKING:
     from lare_rl.new_task.draft import Draft
     from lare_rl.tasks.spec import TaskSpec
 
+GOOD_R2 = 0.8
+"""From this R² of returns on, factors are worth training with."""
 
-def prompt(task: Task, kind: FunctionKind = "factors") -> None:
-    """Print the request that a language model gets for a task.
 
-    Args:
-        task: a shipped name (see `lare-rl tasks`), or the path of a task file.
-        kind: what the function returns: several factors, or one reward.
-    """
+def prompt(task: Task, kind: Kind = "factors") -> None:
+    """Print the request that a language model gets for a task."""
     from lare_rl.envs.load import load_task
     from lare_rl.llm.prompts import candidate
     from lare_rl.tasks.spec import require_role
@@ -126,8 +123,8 @@ def _draft(source: str) -> "Draft":
 
 def verify(
     file: Annotated[Positional[Path], tyro.conf.arg(metavar="FILE")],
-    task: Annotated[str, tyro.conf.arg(metavar="TASK")],
-    kind: FunctionKind = "factors",
+    task: TaskName,
+    kind: Kind = "factors",
     data: Data = None,
     fit: int = 0,
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
@@ -141,10 +138,6 @@ def verify(
 
     Args:
         file: Python source, a function that `lare-rl design` saved, or a model's reply to the request of `lare-rl prompt` (.json).
-        task: a shipped name (see `lare-rl tasks`), or the path of a task file.
-        kind: what the function returns: several factors, or one reward.
-        data: logged episodes; the function is checked on their steps instead of random steps of the environment. A directory, a
-            Parquet file, or the id of a local Minari data set.
         fit: number of episodes, 20 or more, whose returns the factors are fitted to: the first of --data, or episodes that are
             played with random actions, the same in every call.
         policy: a run whose policy plays the episodes for --fit, instead of random actions.
@@ -210,7 +203,6 @@ def _load_episodes(role: "TaskSpec", data: str | None, n_episodes: int, policy: 
 def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: Sequence["Episode"]) -> None:
     """Print how well the factors explain the returns of some episodes."""
     from lare_rl.training.reflect import assess_function
-    from lare_rl.util.findings import format_for_reader
 
     assessment = assess_function(function, role, episodes)
     n_steps = sum(len(episode.team_reward) for episode in episodes) / len(episodes)
@@ -260,17 +252,16 @@ def _better_observation(
 ) -> str | None:
     """Return a sentence on the other scored observation that explains the returns best; None if none does clearly better."""
     from lare_rl.training.reflect import assess_function
-    from lare_rl.util.findings import format_for_reader
 
-    assessments = {}
+    better = {}
     for name in get_args(ScoredObservation):
         if name != role.scored_observation:
             other_role = role.model_copy(update={"scored_observation": name})
-            assessments[name] = assess_function(function, other_role, episodes)
-    better = [name for name, other in assessments.items() if other.r2 - other.r2_error > r2]
+            other = assess_function(function, other_role, episodes)
+            if other.r2 - other.r2_error > r2:
+                better[name] = other.r2
     if not better:
         return None
-    # Of equally good ones the first, which is simpler.
-    best = max(better, key=lambda name: round(assessments[name].r2, 2))
-    other_r2, this_r2 = (format_for_reader(value, "r2") for value in (assessments[best].r2, r2))
+    best = max(better, key=lambda name: round(better[name], 2))  # of equally good ones the first, which is simpler
+    other_r2, this_r2 = (format_for_reader(value, "r2") for value in (better[best], r2))
     return f"--scored-observation {best} explains more (R² {other_r2} instead of {this_r2}): set it in the task file."

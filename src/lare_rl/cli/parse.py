@@ -29,7 +29,7 @@ _NUMBERS = {int: "a whole number, such as 10000", float: "a number, such as 0.5"
 
 
 class _InvalidValueError(LareError):
-    """A word of the command line is not a number, or none of the choices. Unlike a `ValueError`, tyro does not catch it."""
+    """A word of the command line is not a number, or not one of the choices. Unlike a `ValueError`, tyro does not catch it."""
 
     def __init__(self, text: str, expected: str):
         super().__init__(f"{text!r} is not {expected}")
@@ -73,7 +73,7 @@ def parse(
 
 
 def _make_rules(hidden: frozenset[str] = frozenset()) -> ConstructorRegistry:
-    """Return tyro's rules for models, numbers and choices. The help leaves out the models with the names `hidden`."""
+    """Return tyro's rules for models, numbers and choices. The help leaves out the models whose fields have the names `hidden`."""
     rules = ConstructorRegistry()
     rules.struct_rule(functools.partial(_read_model, hidden=hidden))
     rules.primitive_rule(_read_value)
@@ -89,7 +89,7 @@ def _hidden_algorithms(options: Sequence[str]) -> frozenset[str]:
 
 
 def _find_option(value: str, options: Sequence[str]) -> str:
-    """Return the name of the first option with this value and a colon, or an empty text if no option has it."""
+    """Return `--option: ` for the first option with this value, or an empty text."""
     name = ""
     for word in options:
         if word.startswith("--"):
@@ -107,10 +107,10 @@ def _first_paragraph(box: str) -> str:
 
 
 def _defer(command: Callable[..., None], options: Sequence[str] = ()) -> Callable[..., Callable[[], None]]:
-    """Return a function with the signature of a command that only stores its arguments.
+    """Return a function with the signature of a command that only stores its arguments, and returns the call of the command.
 
-    So an error inside the command is not taken for an error of the command line. `options` are the words of the command line.
-    With --config, they change the settings of this file.
+    So tyro does not take an error inside the command for an error of the command line. With --config, the settings that `options`, the
+    words of the command line, name replace those of the file.
     """
     signature = inspect.signature(command)
 
@@ -134,17 +134,17 @@ def _defer(command: Callable[..., None], options: Sequence[str] = ()) -> Callabl
 
 
 def _requested_keys(options: Sequence[str]) -> Iterator[str]:
-    """Yield the keys of settings that the command line names, such as `td3.gamma`; `no_normalise` for `--no-normalise`."""
+    """Yield the keys of settings that the command line names, such as `td3.gamma`."""
     for option in options:
         if option.startswith("--"):
             key = option[2:].partition("=")[0].replace("-", "_")
             yield key
-            table, dot, name = key.rpartition(".")  # a switch that is turned off
-            yield f"{table}{dot}{name.removeprefix('no_')}"
+            table, dot, name = key.rpartition(".")
+            yield f"{table}{dot}{name.removeprefix('no_')}"  # --no-normalise turns a switch off
 
 
 def _merge(old: Mapping[str, Any], new: Mapping[str, Any], keys: Set[str], prefix: str = "") -> dict[str, Any]:
-    """Return nested settings with new values for these keys."""
+    """Return the old nested settings, with the new values of these dotted keys."""
     merged = dict(old)
     for name, value in new.items():
         if isinstance(value, Mapping):
@@ -157,14 +157,17 @@ def _merge(old: Mapping[str, Any], new: Mapping[str, Any], keys: Set[str], prefi
 def _option_names(command: Callable[..., None]) -> Iterator[str]:
     for name, parameter in inspect.signature(command).parameters.items():
         is_model = isinstance(parameter.default, CheckedModel)
-        for key in model_keys(type(parameter.default)) if is_model else [name]:
+        keys = list(model_keys(type(parameter.default))) if is_model else [name]
+        tables = {key.partition(".")[0] for key in keys if "." in key}
+        for key in keys:
             table, dot, last = key.replace("_", "-").rpartition(".")
-            yield f"--{table}{dot}{last}"
-            yield f"--{table}{dot}no-{last}"  # only switches have it, but a misspelt word is close to no other option
+            if key not in tables:
+                yield f"--{table}{dot}{last}"
+                yield f"--{table}{dot}no-{last}"  # only switches have it, but a misspelt word is close to no other option
 
 
 def _read_model(info: StructTypeInfo, hidden: frozenset[str]) -> StructConstructorSpec | None:
-    """Make an option of each field of a model. If the model itself may be None, so may all of its fields."""
+    """Return the rule that makes an option of each field of a model. If the model may be None, so may all of its fields."""
     if not (isinstance(info.type, type) and issubclass(info.type, CheckedModel)):
         return None
     may_be_none = not isinstance(info.default, info.type)
@@ -191,7 +194,7 @@ def _read_model(info: StructTypeInfo, hidden: frozenset[str]) -> StructConstruct
 
 
 def _read_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """Convert numbers and choices."""
+    """Return the rule that converts numbers and choices, or None for other types."""
     choices = get_args(info.type) if info.type_origin is Literal else ()
     if choices:
         expected = f"one of {', '.join(choices)}"

@@ -22,9 +22,9 @@ def evaluate(
 ) -> None:
     """Evaluate the policy of a run by its true return, from initial states that no evaluation of the run has used.
 
-    Prints the mean return of the policy with its standard deviation. Then plays random actions for as many episodes, but at least
-    ten, or five where they are slow. Prints the same of them, and the difference with its standard error. In an environment in
-    Python, random actions begin in the same initial states. A policy that samples its actions also plays the most likely ones.
+    Prints the mean return of the policy and of random actions, with their standard deviations, and the difference with its standard
+    error. Random actions are played for as many episodes, but at least ten, or five where they are slow; in an environment in Python,
+    from the same initial states. A policy that samples its actions also plays the most likely ones.
 
     Args:
         run: a run directory.
@@ -60,15 +60,15 @@ def evaluate(
 
 
 def _refuse_untrusted(directory: Path) -> None:
-    """Refuse a run of an untrusted module before the slow imports. If the file cannot be read, `open_run` reports that later."""
+    """Refuse a run of an untrusted module before the slow imports. A file that cannot be read is reported later, by `open_run`."""
     from lare_rl.config.migrate import CONFIG, migrate
     from lare_rl.tasks.spec import TaskSpec
     from lare_rl.tasks.trust import check_trusted
-    from lare_rl.util.safe_io import read_json, read_text
+    from lare_rl.util.safe_io import read_table
 
     try:
-        task = TaskSpec(**migrate(read_json(read_text(directory / CONFIG)))["task"])
-    except (LareError, OSError, ValueError, TypeError, KeyError, AttributeError):
+        task = TaskSpec(**migrate(read_table(directory / CONFIG))["task"])
+    except (LareError, TypeError, KeyError):
         return
     check_trusted(task, directory)
 
@@ -98,19 +98,17 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = True) -> 
     directories = find_run_directories(runs)
     modules = {untrusted_module(read_config(directory).task) for directory in directories} - {None}
     untrusted = ",".join(sorted(map(str, modules)))
+    remedy = f"set {TRUST_VARIABLE}={untrusted} to allow the import"
     path = out or default_path(directories)
     if untrusted and out is None and path.exists():
         raise LareError(
-            f"the new {path} would have no random play, credit and factors, because {untrusted} is not imported: set "
-            f"{TRUST_VARIABLE}={untrusted} to allow the import, or write another file with --out"
+            f"the new {path} would have no random play, credit and factors, because {untrusted} is not imported: {remedy}, or write "
+            "another file with --out"
         )
     print_progress("drawing, which takes up to a minute for each run")
     print_line(f"wrote {write_report(directories, path, film)}")
     if untrusted:
-        print_progress(
-            f"random play, credit and factors are left out, because {untrusted} was not imported: set {TRUST_VARIABLE}={untrusted} "
-            "to allow the import"
-        )
+        print_progress(f"random play, credit and factors are left out, because {untrusted} was not imported: {remedy}")
 
 
 def export(

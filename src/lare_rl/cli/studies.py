@@ -16,18 +16,18 @@ from lare_rl.errors import LareError
 _BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
 """A directory of the checkout. It does not exist if LaRe was installed from a package index."""
 
-Ray = Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")]
+_RAY_HELP = "the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray])."
+Ray = Annotated[str | None, tyro.conf.arg(metavar="ADDRESS", help=_RAY_HELP)]
 
 
 def sweep(
     file: Annotated[Positional[Path], tyro.conf.arg(metavar="FILE")], ray: Ray = None, check: bool = False
 ) -> None:
-    """Train the runs that a TOML file lists and that are not finished yet. All metrics go to results.csv and .parquet.
+    """Train the runs of a TOML file that are not finished yet. All metrics go to results.csv and results.parquet.
 
     Args:
         file: lists tasks, methods, algorithms, draws and settings, and how many processes run at a time, on how many cores and
             accelerators each (docs/how-to/sweeps.md).
-        ray: the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
         check: only check the file, list its runs and how far they are, and train nothing.
     """
     from lare_rl.cli.sweep_progress import show_progress
@@ -51,9 +51,9 @@ def sweep(
         return
 
     def write_tables() -> None:
-        rows = read_metric_rows(job.directory for job in jobs)
-        for path in write_table(rows, jobs[0].directory.parent.parent / "results") if rows else ():
-            print_line(f"wrote {path}")
+        if rows := read_metric_rows(job.directory for job in jobs):
+            for path in write_table(rows, jobs[0].directory.parent.parent / "results"):
+                print_line(f"wrote {path}")
 
     try:
         with show_progress(jobs) as on_message:
@@ -131,7 +131,6 @@ def reproduce(
         processes: number of runs at a time.
         cores: number of cores for each run.
         accelerators: number of accelerators for each run; less than 1 if runs share one. By default, an equal share.
-        ray: the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
     """
     from lare_rl.cli.sweep_progress import show_progress
     from lare_rl.sweep.resources import Resources

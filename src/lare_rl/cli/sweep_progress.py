@@ -42,11 +42,11 @@ def show_progress(jobs: Sequence[Job]) -> Iterator[Callable[[str], None]]:
 
 def update_bars(jobs: Sequence[Job], bars: Progress, ended: threading.Event, refresh_s: float = 2.0) -> None:
     """Update the bars until the sweep has ended. Only active runs have a bar."""
-    all_runs = bars.add_task("all runs", total=sum(job.resolved.steps for job in jobs))
+    all_runs_id = bars.add_task("all runs", total=sum(job.resolved.steps for job in jobs))
     bar_ids: dict[str, TaskID] = {}
     while not ended.is_set():
         steps = {job.name: _current_step(job) for job in jobs}
-        bars.update(all_runs, completed=sum(steps.values()))
+        bars.update(all_runs_id, completed=sum(steps.values()))
         for job in jobs:
             step, total = steps[job.name], job.resolved.steps
             if 0 < step < total and job.name not in bar_ids:

@@ -1,4 +1,4 @@
-"""What the commands share: types of their arguments, and functions that print."""
+"""What the commands share: types of their arguments, with their help, and functions that load and print."""
 
 import os
 import sys
@@ -13,7 +13,7 @@ from tyro.conf import Positional
 
 from lare_rl.errors import CheckedModel, Count, LareError
 from lare_rl.llm.budget import Budget
-from lare_rl.llm.prompts import Message
+from lare_rl.llm.prompts import FunctionKind, Message
 from lare_rl.util.findings import format_for_reader
 from lare_rl.util.sanitize import one_line, sanitize
 
@@ -23,16 +23,23 @@ if TYPE_CHECKING:
     from lare_rl.llm.live import LiveModel
     from lare_rl.tasks.spec import TaskSpec
 
-Task = Annotated[Positional[str], tyro.conf.arg(metavar="TASK")]
+_TASK_HELP = "a shipped name (see `lare-rl tasks`), or the path of a task file."
+_DATA_HELP = (
+    "logged episodes; functions are checked on their steps instead of random steps of the environment. A directory, a Parquet file, or "
+    "the id of a local Minari data set."
+)
+TaskName = Annotated[str, tyro.conf.arg(metavar="TASK", help=_TASK_HELP)]
+Task = Positional[TaskName]
 RunDirectory = Annotated[Positional[Path], tyro.conf.arg(metavar="RUN")]
 RunDirectories = Annotated[
     Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN", help_behavior_hint="(one or more)")
 ]
-Data = Annotated[str | None, tyro.conf.arg(metavar="DATASET")]
+Data = Annotated[str | None, tyro.conf.arg(metavar="DATASET", help=_DATA_HELP)]
+Kind = Annotated[FunctionKind, tyro.conf.arg(help="what the function returns: several factors, or one reward.")]
 
 FIRST_PROGRESS_S, PROGRESS_S = 5.0, 20.0
 """Seconds before the first line of progress, and between two lines."""
-_TABLE_WIDTH = 200
+TABLE_WIDTH = 200
 """Characters in a line of a table, where the output is not a terminal."""
 
 _NonNegative = Annotated[float, Field(ge=0)]
@@ -86,7 +93,7 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     table.columns[0].no_wrap = True
     for row in rows:
         table.add_row(*map(sanitize, row))
-    Console(width=None if sys.stdout.isatty() else _TABLE_WIDTH, markup=False).print(table)
+    Console(width=None if sys.stdout.isatty() else TABLE_WIDTH, markup=False).print(table)
 
 
 def print_progress(text: str) -> None:
@@ -103,7 +110,7 @@ def discard_output(stream: TextIO) -> None:
 
 
 class EpisodeProgress:
-    """Prints how many episodes have been played and the time left: after the first and then every `PROGRESS_S`, if they take long."""
+    """Prints the number of played episodes and the time left: first after `FIRST_PROGRESS_S`, then every `PROGRESS_S`."""
 
     def __init__(self, n_episodes: int):
         self._n_episodes = n_episodes
@@ -126,7 +133,7 @@ def print_error(error: Exception) -> None:
 
 
 def load_steps(data: str | None, task: "TaskSpec") -> "Steps | None":
-    """Load the steps of a log that functions are checked on."""
+    """Load the steps of a log, on which functions are checked."""
     if data is None:
         return None
     from lare_rl.logs.steps import logged_steps
@@ -135,7 +142,7 @@ def load_steps(data: str | None, task: "TaskSpec") -> "Steps | None":
 
 
 def load_playing_policy(run: Path | None, spec: "TaskSpec") -> "Policy | None":
-    """Load the policy of a run that is to play a task."""
+    """Load the policy of a run, which plays a task."""
     if run is None:
         return None
     from lare_rl.evaluation.policy import RunPolicy

@@ -6,6 +6,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from lare_rl.cli.design import check_function_files
 from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_messages, print_progress
 from lare_rl.errors import LareError
 from lare_rl.util.files import check_new_path, write_bytes
@@ -21,7 +22,7 @@ def turn_credit(
     logistic: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Give each turn of an agent's rollouts its credit, from the outcomes of the rollouts, and say how far to trust it.
+    """Give each turn of an agent's rollouts its credit, from the outcomes of the rollouts. Says how far to trust it.
 
     Each line of ROLLOUTS is a JSON object: "messages" in the form of OpenAI's chat completions, or "turns" with numbers, or both; an
     "outcome"; and optionally a "group" (the task) and "truncated". CREDITED has the same lines with a key "credit"
@@ -30,7 +31,7 @@ def turn_credit(
     Args:
         rollouts: a JSONL file.
         out: the JSONL file to write.
-        report: a page to write: some rollouts as strips of turns, what features are worth, and how far to trust it.
+        report: a page to write: some rollouts as strips of turns, the effects of features, and how far to trust the credit.
         function: a phi over turns (.py): it reads each turn and names its events.
         lambda_: of generalized advantages, 0 to 1. The default is measured: 0.8, 0.95 or 1.
         logistic: model the log odds of outcomes between 0 and 1.
@@ -39,16 +40,15 @@ def turn_credit(
     from lare_rl.turns.credit import TurnCredit
     from lare_rl.turns.features import tabulate
     from lare_rl.turns.files import read_rollout_file, write_credit_file
+    from lare_rl.turns.phi import load_turn_phi
     from lare_rl.turns.rollouts import read_rollouts
 
-    for path, option in ((out, "--out"), (report, "--report")):
-        if path is not None:
-            check_new_path(path, option, overwrite)
-    phi = None
-    if function is not None:
-        from lare_rl.turns.phi import load_turn_phi
-
-        phi = load_turn_phi(function)
+    check_new_path(out, "--out", overwrite)
+    if report is not None:
+        check_new_path(report, "--report", overwrite)
+        if report.resolve() == out.resolve():
+            raise LareError(f"--out writes {out} too: choose another --report")
+    phi = None if function is None else load_turn_phi(function)
     credit = TurnCredit(lambda_, logistic=logistic)
     contents = read_rollout_file(rollouts)
     checked = read_rollouts(contents, phi)
@@ -73,9 +73,9 @@ def turn_phi(
 ) -> None:
     """Let a language model write a phi over turns, which names the events of each turn for `turn-credit --function`.
 
-    Without --model, prints the request that a model gets: you can ask a model of your choice by hand. With it, the function is checked on
-    the turns of ROLLOUTS and corrected until it passes. A live model needs the extra lare-rl[llm]; its key comes from the environment
-    variable OPENAI_API_KEY (see `lare-rl design --help`).
+    Without --model, prints the request, with which you can ask a model by hand. With it, the function is checked on the turns of ROLLOUTS
+    and corrected until it passes. A live model needs the extra lare-rl[llm]; its key comes from the environment variable
+    OPENAI_API_KEY (see `lare-rl design --help`).
 
     Args:
         rollouts: a JSONL file of rollouts with messages.
@@ -97,12 +97,8 @@ def turn_phi(
     if model is None:
         print_messages(turn_request(goal, descriptions, choose_examples(turns)))
         return
+    out = check_function_files(out)
     record = None if out is None else out.with_suffix(".json")
-    if out is not None and out == record:
-        raise LareError(f"{out} is for the model's replies; choose another --out, such as {out.with_suffix('.py')}")
-    for path in (out, record):
-        if path is not None:
-            check_new_path(path, "--out")
     live_model = live.open(model)
     try:
         designed = design_turn_phi(goal, descriptions, turns, live_model, record=record)

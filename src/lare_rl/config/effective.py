@@ -6,10 +6,10 @@ from typing import Any
 from lare_rl.algorithms.registry import ALGORITHMS, Consumes
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.methods import METHODS
+from lare_rl.credit.methods import METHODS, Method
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["effective_settings", "needs_replay", "unused_names", "unused_settings", "warmup_warning"]
+__all__ = ["effective_settings", "fits_separately", "needs_replay", "unused_names", "unused_settings", "warmup_warning"]
 
 
 def effective_settings(settings: ResolvedSettings) -> dict[str, Any]:
@@ -23,7 +23,7 @@ def effective_settings(settings: ResolvedSettings) -> dict[str, Any]:
 
 
 def unused_settings(settings: Settings, resolved: ResolvedSettings, task: TaskSpec) -> dict[str, str]:
-    """Return a message about each setting that is given but not used, by dotted names."""
+    """Return a message about each setting that a user changed and the run does not use, by dotted names."""
     defaults, effective = dict(_flatten(Settings().model_dump())), effective_settings(resolved)
     other_algorithms = [name for name in ALGORITHMS if name != resolved.algorithm]
     unused = unused_names(resolved)
@@ -44,12 +44,12 @@ def unused_names(settings: ResolvedSettings) -> list[str]:
     """Return the dotted names of settings that this algorithm and method do not use."""
     method, algorithm = METHODS.find(settings.method), ALGORITHMS[settings.algorithm]
     on_policy = algorithm.consumes is Consumes.ROLLOUTS
-    separate_fit = method.fit is not None and method.fit.separate
+    has_fits = fits_separately(method, algorithm.consumes)
     has_mixer = getattr(settings.hyperparameters, "monotonic", True)
     is_used = {
-        "fit_every": method.uses_gradient and (on_policy or separate_fit),
-        "fit_updates": method.uses_gradient and (on_policy or separate_fit),
-        "first_fit": method.uses_gradient and on_policy and algorithm.multi_agent,
+        "fit_every": has_fits,
+        "fit_updates": has_fits,
+        "first_fit": has_fits and on_policy and algorithm.multi_agent,
         "scored_observation": method.uses_scored_observation,
         "draw": method.needs_phi,
         "candidates": method.needs_phi,
@@ -61,6 +61,11 @@ def unused_names(settings: ResolvedSettings) -> list[str]:
     }
     is_used |= {f"credit.{name}": name in method.settings for name in CreditSettings.model_fields}
     return [name for name, used in is_used.items() if not used]
+
+
+def fits_separately(method: Method, consumes: Consumes) -> bool:
+    """Return whether the decoder makes gradient updates of its own between iterations, not one with each of the algorithm's."""
+    return method.uses_gradient and (consumes is Consumes.ROLLOUTS or (method.fit is not None and method.fit.separate))
 
 
 def needs_replay(settings: ResolvedSettings) -> bool:

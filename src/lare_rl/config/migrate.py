@@ -4,7 +4,7 @@ When a setting gets another name or meaning, `FORMAT` is increased, and a new ro
 and comparisons of old runs are still possible. Their checkpoints are read by `util/renamed_fields.py`, if only names differ.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from lare_rl.errors import LareError
@@ -18,8 +18,11 @@ CONFIG = "config.json"
 FORMAT = 9
 """The format of config.json. It is increased whenever its contents change."""
 
+Values = dict[str, Any]
+Migration = Callable[[Values], Values]
 
-def migrate(values: dict[str, Any]) -> dict[str, Any]:
+
+def migrate(values: Values) -> Values:
     """Return the values in the current format. Raises `LareError` if their format is newer, or too old."""
     number = values.get("format")
     while isinstance(number, int) and number in _MIGRATIONS:
@@ -32,39 +35,32 @@ def migrate(values: dict[str, Any]) -> dict[str, Any]:
     return values
 
 
-Values = dict[str, Any]
+def _change_table(name: str, change: Migration) -> Migration:
+    """Return a function that changes one table. What is no table, in a damaged file, stays."""
+
+    def migration(values: Values) -> Values:
+        table = values.get(name)
+        return values | {name: change(table)} if isinstance(table, dict) else values
+
+    return migration
 
 
-def _change(values: Values, names: Sequence[str], change: Callable[[Values], Values]) -> Values:
-    """Change the table at the end of a path of names. What is no table, in a damaged file, stays."""
-    if not names:
-        return change(values)
-    table = values.get(names[0])
-    return values | {names[0]: _change(table, names[1:], change)} if isinstance(table, dict) else values
+def _change_credit(change: Migration) -> Migration:
+    return _change_table("settings", _change_table("credit", change))
 
 
 def _without(values: Values, name: str) -> Values:
     return {key: value for key, value in values.items() if key != name}
 
 
-def _from_4(values: Values) -> Values:
-    # `reflect_every` replaced phi during a run. The oldest runs have no `first_fit`.
-    return _change(values, ["settings"], lambda table: {"first_fit": "published"} | _without(table, "reflect_every"))
-
-
-_MIGRATIONS: Mapping[int, Callable[[Values], Values]] = {
+_MIGRATIONS: Mapping[int, Migration] = {
     2: lambda values: values,  # only the checkpoint changed
     3: lambda values: _without(values, "isolation"),  # it said how the process that executed phi was isolated
-    4: _from_4,
+    # `reflect_every` replaced phi during a run. The oldest runs have no `first_fit`.
+    4: _change_table("settings", lambda table: {"first_fit": "published"} | _without(table, "reflect_every")),
     5: rename_keys,  # keys of settings and tasks got other names
-    6: lambda values: _change(
-        values, ["settings", "credit"], lambda credit: {"exact": "no"} | credit
-    ),  # none were exact
-    7: lambda values: _change(
-        values, ["settings", "credit"], lambda credit: _without(credit, "optimism")
-    ),  # it did not help
-    8: lambda values: _change(
-        values, ["settings", "credit"], lambda credit: {"start_value": False} | credit
-    ),  # no sum had one
+    6: _change_credit(lambda credit: {"exact": "no"} | credit),  # none were exact
+    7: _change_credit(lambda credit: _without(credit, "optimism")),  # it did not help
+    8: _change_credit(lambda credit: {"start_value": False} | credit),  # no sum had one
 }
 """Functions that convert a format to the next one."""

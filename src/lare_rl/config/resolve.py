@@ -19,7 +19,7 @@ from lare_rl.tasks.spec import TaskSpec
 __all__ = ["choose_algorithm", "fill_in", "resolve"]
 
 MIN_EVALUATIONS = 5
-"""Evaluations of a short run of PPO, by default."""
+"""Evaluations of a short run of an algorithm that consumes rollouts, by default."""
 
 
 def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
@@ -67,8 +67,8 @@ def choose_algorithm(name: str | None, env: EnvSpec) -> str:
 
 
 def _apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
-    algorithm = choose_algorithm(settings.algorithm, env)
-    row = ALGORITHMS[algorithm]
+    name = choose_algorithm(settings.algorithm, env)
+    algorithm = ALGORITHMS[name]
     defaults: dict[str, Any] = {
         "method": "lare-bayes",
         "steps": 1_000_000,
@@ -78,31 +78,33 @@ def _apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
         "fit_updates": 1,
         "evaluation_episodes": 10,
         "credit": {},
-        **row.run_defaults(env, settings.environments),
+        **algorithm.run_defaults(env, settings.environments),
     }
-    iteration = (settings.rollout_steps or defaults["rollout_steps"]) * defaults["environments"]
-    n_iterations = max(1, round(defaults["steps"] / iteration))
-    defaults["steps"] = round_up(settings.steps or n_iterations * iteration, iteration)
-    n_iterations = defaults.pop("evaluate_iterations", None) or max(1, round(defaults["evaluate_every"] / iteration))
-    if row.consumes is Consumes.ROLLOUTS:
-        n_iterations = min(n_iterations, max(1, defaults["steps"] // (MIN_EVALUATIONS * iteration)))
-    defaults["evaluate_every"] = round_up(settings.evaluate_every or n_iterations * iteration, iteration)
-    method = METHODS.find(settings.method or defaults["method"])
-    if method.fit is not None and method.fit.separate:
-        defaults["fit_updates"] = max(1, iteration // 50)
+    evaluate_iterations = defaults.pop("evaluate_iterations", None)
+    values = defaults | {key: value for key, value in settings if value is not None and key not in ALGORITHMS}
+    iteration = values["rollout_steps"] * values["environments"]
 
-    set_values = {name: value for name, value in settings if value is not None and name not in ALGORITHMS}
-    credit = MULTI_AGENT_CREDIT if row.multi_agent else CreditSettings()
-    set_credit = (
-        {name: getattr(settings.credit, name) for name in settings.credit.model_fields_set} if settings.credit else {}
-    )
-    decided = {
-        "algorithm": algorithm,
-        "hyperparameters": getattr(settings, algorithm, row.settings),  # one that was registered late has no field
-        "credit": credit.model_copy(update=defaults["credit"] | set_credit),
+    n_iterations = max(1, round(defaults["steps"] / iteration))
+    steps = round_up(settings.steps or n_iterations * iteration, iteration)
+    n_iterations = evaluate_iterations or max(1, round(defaults["evaluate_every"] / iteration))
+    if algorithm.consumes is Consumes.ROLLOUTS:
+        n_iterations = min(n_iterations, max(1, steps // (MIN_EVALUATIONS * iteration)))
+    evaluate_every = round_up(settings.evaluate_every or n_iterations * iteration, iteration)
+
+    method = METHODS.find(values["method"])
+    if settings.fit_updates is None and method.fit is not None and method.fit.separate:
+        values["fit_updates"] = max(1, iteration // 50)
+    credit = MULTI_AGENT_CREDIT if algorithm.multi_agent else CreditSettings()
+    credit_changes = settings.credit.model_dump(exclude_unset=True) if settings.credit else {}
+    values |= {
+        "algorithm": name,
+        # An algorithm that was registered after `Settings` was defined has no field.
+        "hyperparameters": getattr(settings, name, algorithm.settings),
+        "steps": steps,
+        "evaluate_every": evaluate_every,
+        "credit": credit.model_copy(update=defaults["credit"] | credit_changes),
     }
-    rounded = {name: defaults[name] for name in ("steps", "evaluate_every")}
-    return ResolvedSettings(**{**defaults, **set_values, **decided, **rounded})
+    return ResolvedSettings(**values)
 
 
 def _normalise(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> ResolvedSettings:
@@ -141,13 +143,15 @@ def _check_algorithm(algorithm: Algorithm, task: TaskSpec, env: EnvSpec) -> None
 
 def _check_size(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> None:
     """Raise `LareError` if a run is too short, or if the replay could not hold the steps of an iteration."""
-    required = env.max_steps * resolved.environments // 2
-    if resolved.steps < required:
+    min_steps = env.max_steps * resolved.environments // 2
+    if resolved.steps < min_steps:
         raise LareError(
             f"steps = {resolved.steps} are too few: an episode of {task.name} takes up to {env.max_steps} steps, and a run with "
-            f"environments = {resolved.environments} needs at least {required}"
+            f"environments = {resolved.environments} needs at least {min_steps}"
         )
-    required = required_capacity(resolved.rollout_steps, env.max_steps) * resolved.environments
-    if needs_replay(resolved) and resolved.capacity < required:
+    min_capacity = required_capacity(resolved.rollout_steps, env.max_steps) * resolved.environments
+    if needs_replay(resolved) and resolved.capacity < min_capacity:
         data = "a rollout" if ALGORITHMS[resolved.algorithm].consumes is Consumes.ROLLOUTS else "an iteration"
-        raise LareError(f"capacity = {resolved.capacity} is too small: {data} of {task.name} takes up to {required}")
+        raise LareError(
+            f"capacity = {resolved.capacity} is too small: {data} of {task.name} takes up to {min_capacity}"
+        )

@@ -23,8 +23,8 @@ MAX_SEEDS = 1000
 
 Undecided = TypeVar("Undecided")
 """The type of a value that is not decided yet: None in `Settings`, and Never in `ResolvedSettings`."""
-
 UNDECIDED: Any = None
+"""The default of these settings."""
 
 
 class _RunSettings(CheckedModel, Generic[Undecided]):
@@ -119,19 +119,19 @@ class Settings(create_model("_AlgorithmFields", __base__=_RunSettings[None], __m
             kind, default = _HYPERPARAMETERS[name]
             changes = values[name]
             if isinstance(changes, kind):
-                changes = {field: getattr(changes, field) for field in changes.model_fields_set}
+                changes = changes.model_dump(exclude_unset=True)
             if isinstance(changes, Mapping):
                 completed[name] = {**dict(default), **changes}
         return completed
 
 
 def round_up(steps: int, iteration_steps: int) -> int:
-    """Return the steps of whole iterations."""
+    """Round a number of steps up to whole iterations."""
     return math.ceil(steps / iteration_steps) * iteration_steps
 
 
 class ResolvedSettings(_RunSettings[Never]):
-    """The settings that a run uses.
+    """The settings of a run, all of them decided.
 
     Two values may be None: `scored_observation` (the task decides) and `first_fit` (the run does not use it).
     """

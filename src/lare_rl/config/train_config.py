@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm, AlgorithmSettings, Consumes, Noise
-from lare_rl.config.effective import needs_replay
+from lare_rl.config.effective import fits_separately, needs_replay
 from lare_rl.config.settings import ResolvedSettings
 from lare_rl.credit.decoder_settings import RECENT_STEPS, CreditSettings
 from lare_rl.credit.methods import METHODS, Method
@@ -41,7 +41,7 @@ class CreditConfig:
     rollout_steps: int
     """Steps of each environment in an iteration."""
     capacity: int
-    """Rows of the replay, of each environment."""
+    """Rows of the replay for each environment."""
     fit_updates: int
     """Updates of the decoder in an iteration that fits it. Unused if the decoder is updated with every update of the
     algorithm."""
@@ -192,17 +192,12 @@ class TrainConfig(CreditConfig):
     @property
     def joint_fit(self) -> bool:
         """Whether the decoder is updated with every update of the algorithm."""
-        return (
-            self.consumes is not Consumes.ROLLOUTS
-            and self.method.uses_gradient
-            and self.method.fit is not None
-            and not self.method.fit.separate
-        )
+        return self.method.uses_gradient and not self.fits_separately
 
     @property
     def fits_separately(self) -> bool:
         """Whether the decoder makes gradient updates of its own, between iterations."""
-        return self.method.uses_gradient and not self.joint_fit
+        return fits_separately(self.method, self.consumes)
 
     @property
     def has_first_fit(self) -> bool:
@@ -213,7 +208,7 @@ class TrainConfig(CreditConfig):
 def make_train_config(
     task: TaskSpec, settings: ResolvedSettings, functions: Sequence[LatentFunction] = (), n_devices: int = 1
 ) -> TrainConfig:
-    """Return the static configuration of a run, by the latent function of each team, if they are chosen already."""
+    """Return the static configuration of a run. `functions` are the latent functions of its teams, if they are chosen already."""
     env, algorithm = load_env_spec(task), ALGORITHMS[settings.algorithm]
     scored_observation = settings.choose_scored_observation(task)
     return TrainConfig(
@@ -241,9 +236,12 @@ def make_train_config(
 
 
 def replay_rows(settings: ResolvedSettings, max_steps: int) -> int:
-    """Return the rows of each environment, if an episode has up to `max_steps` steps."""
+    """Return the rows of the replay for each environment. An episode has up to `max_steps` steps."""
     required = required_capacity(settings.rollout_steps, max_steps)
     rows = settings.capacity // settings.environments
     if not needs_replay(settings):  # only to compare the newest rewards with the true ones
         rows = required + RECENT_STEPS // settings.environments
-    return min(rows, max(required, 2 * settings.steps // settings.environments + 2))
+    all_rows = (
+        2 * settings.steps // settings.environments + 2
+    )  # of the run, if every episode has one step, which takes two rows
+    return min(rows, max(required, all_rows))

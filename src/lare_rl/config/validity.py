@@ -23,7 +23,7 @@ def check_credit(spec: CreditSpec, n_agents: int, *, discrete_actions: bool = Tr
         n_agents: the agents of all teams.
         discrete_actions: whether actions are discrete. True if it is not known.
     """
-    for problem in _find_problems(spec, n_agents, discrete_actions):
+    if problem := next(_find_problems(spec, n_agents, discrete_actions), None):
         raise LareError(problem)
 
 
@@ -78,7 +78,7 @@ def check_training(config: CreditConfig) -> None:
         )
     if config.consumes is not Consumes.ROLLOUTS and method.uses_gradient and config.credit.exact != "no":
         raise LareError(
-            f"exact needs proxy rewards that stay the same during an iteration, and the updates of an off-policy algorithm change "
+            "exact needs proxy rewards that stay the same during an iteration, and the updates of an off-policy algorithm change "
             f"those of {method.name}: use bayes or lare-bayes, or the algorithms ppo or ippo"
         )
 

@@ -1,10 +1,19 @@
 """Texts of a task from the documentation of its environment, without the sentences about rewards."""
 
 import inspect
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 
-__all__ = ["first_section", "plain_lines", "remove_rewards", "single_agent_lines", "split_sections", "write_texts"]
+__all__ = [
+    "first_section",
+    "plain_lines",
+    "remove_rewards",
+    "single_agent_lines",
+    "split_sections",
+    "unused_titles",
+    "write_texts",
+]
 
 HEADING = re.compile(r"^[ \t]*#+\s*(.+?)\s*$", re.MULTILINE)
 
@@ -23,16 +32,24 @@ MIN_WORDS = 8
 SENTENCE_END = re.compile(r"(?<=[^\d][.!?])\s+(?=[A-Z`*])")
 
 FIGURE = re.compile(r"^```\{.*?^```|<[^<>\n]+>", re.MULTILINE | re.DOTALL)
+"""A directive of Sphinx in a code block, or a tag of HTML."""
 NOISE = re.compile(r"^!\[|^:?-{3,}|^```|^\s*$")
+"""The start of a line without text: an image, a rule, a code fence, or an empty line."""
 NUMBERED = re.compile(r"\d+(\s*(-|to)\s*\d+)?[.:]\s")
 """The start of a line about one entry or several: `3: ...`, `3 to 5: ...`."""
 FIGURE_REFERENCE = re.compile(r"\b(diagram|figure|image|picture) (above|below)\b", re.IGNORECASE)
 
+TITLES = {
+    "description": ("description",),
+    "observation": ("observation space", "observation", "observations"),
+    "action": ("action space", "action", "actions"),
+}
+"""Titles of the section from which a text is taken: the first of them that the documentation has."""
 EPISODE_END_TITLES = ("episode end", "episode termination")
 
 
 def split_sections(documentation: str) -> dict[str, str]:
-    """Return the sections of a text by their headings in lower case. The key "" is the text before the first heading."""
+    """Return the sections of a Markdown text by their headings in lower case. The key "" is the text before the first heading."""
     text = FIGURE.sub("", inspect.cleandoc(documentation))
     first, *rest = HEADING.split(text)
     sections = {"": first}
@@ -41,18 +58,21 @@ def split_sections(documentation: str) -> dict[str, str]:
     return sections
 
 
-def first_section(sections: Mapping[str, str], *titles: str) -> list[str]:
-    """Return the lines of the first section with one of these titles that is not empty."""
-    return plain_lines(next((sections[title] for title in titles if sections.get(title, "").strip()), ""))
+def first_section(sections: Mapping[str, str], key: str) -> list[str]:
+    """Return the lines of the first section about a text that is not empty."""
+    return plain_lines(next((sections[title] for title in TITLES[key] if sections.get(title, "").strip()), ""))
 
 
 def single_agent_lines(sections: Mapping[str, str]) -> dict[str, list[str]]:
-    """Return the lines of each text of a task of one agent, by its key."""
-    return {
-        "description": plain_lines(sections[""]) + first_section(sections, "description"),
-        "observation": first_section(sections, "observation space", "observation"),
-        "action": first_section(sections, "action space", "action"),
-    }
+    """Return the lines of each text of a task of one agent, by its key. The description begins with the text before all headings."""
+    lines = {key: first_section(sections, key) for key in TITLES}
+    return lines | {"description": plain_lines(sections[""]) + lines["description"]}
+
+
+def unused_titles(sections: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the titles of the sections that `single_agent_lines` and `write_texts` do not read."""
+    used = {"", *itertools.chain(*TITLES.values()), *EPISODE_END_TITLES}
+    return tuple(title for title, body in sections.items() if title not in used and body.strip())
 
 
 def write_texts(
@@ -60,11 +80,11 @@ def write_texts(
 ) -> tuple[dict[str, str], tuple[str, ...]]:
     """Return the texts of a task file, and the lines that were removed because they mention rewards.
 
-    `lines` are the lines of each text, by its key. The description is extended by how an episode ends, from the `sections`.
+    `lines` are the lines of each text, by its key. The first section about the end of an episode is appended to the description.
     """
     cleaned = {key: remove_rewards(text) for key, text in lines.items()}
     texts = {key: text for key, (text, _) in cleaned.items()}
-    endings = (remove_rewards(first_section(sections, title))[0] for title in EPISODE_END_TITLES)
+    endings = (remove_rewards(plain_lines(sections.get(title, "")))[0] for title in EPISODE_END_TITLES)
     if texts["description"] and (ending := next(filter(None, endings), "")):
         texts["description"] += f"\n{ending}"
     return texts, tuple(line for _, removed in cleaned.values() for line in removed)
@@ -88,7 +108,7 @@ def plain_lines(text: str) -> list[str]:
             table.append(stripped)
         elif is_item or not NOISE.match(stripped):
             paragraph.append(stripped)
-    return [_remove_markup(line) for line in lines if _remove_markup(line) and not FIGURE_REFERENCE.search(line)]
+    return list(filter(None, (_remove_markup(line) for line in lines if not FIGURE_REFERENCE.search(line))))
 
 
 def _remove_markup(line: str) -> str:

@@ -47,7 +47,7 @@ LIMIT_LINE = (
     "more (longer episodes are cut)"
 )
 
-CONTENTS = {
+CONTENTS = {  # what a person must write where a text is missing
     "description": "what is to be solved, and what the goal is; not a word about the reward",
     "observation": "what each entry of the observation means, with its unit; one entry per line (0: speed in m/s)",
     "action": "what each entry of the action means, with its unit; one entry per line",
@@ -74,7 +74,7 @@ class Draft:
 
     @property
     def lists_entries(self) -> bool:
-        """Whether the text of the observation has lines for single entries, or is missing, or that of each team."""
+        """Whether the text of the observation describes single entries. True if it is missing, or in the files of the teams."""
         text = tomllib.loads(self.toml).get("observation", FILL_IN)
         return FILL_IN in text or bool(entry_meanings(text))
 
@@ -120,31 +120,33 @@ def make_draft(
     name: str,
     lines: Sequence[str],
     texts: Mapping[str, str],
-    first_lines: Mapping[str, str],
+    space_descriptions: Mapping[str, str],
     removed: tuple[str, ...],
     **fields: Any,
 ) -> Draft:
     """Return the draft of a task file: its lines, and then its texts. Missing texts are marked.
 
-    `first_lines` precede texts that begin in another way. `fields` are further fields of `Draft`.
+    `space_descriptions` are the first lines of texts that do not begin with them. `fields` are further fields of `Draft`.
     """
-    missing_keys, lines = tuple(key for key, text in texts.items() if not text), list(lines)
+    missing_keys = tuple(key for key, text in texts.items() if not text)
+    lines = list(lines)
     for key, text in texts.items():
-        text, first = text or f"{FILL_IN}: {CONTENTS[key]}", first_lines.get(key, "")
-        if not text.startswith(first.removesuffix(".")):
-            text = f"{first}\n{text}"
+        text, description = text or f"{FILL_IN}: {CONTENTS[key]}", space_descriptions.get(key, "")
+        if not text.startswith(description.removesuffix(".")):
+            text = f"{description}\n{text}"
         lines.append(f"\n{key} = {_quote(text)}")
     return Draft(name, "\n".join(lines) + "\n", missing_keys, removed, **fields)
 
 
 def _quote(text: str) -> str:
+    """Return a multi-line string of TOML."""
     escaped = text.replace("\\", "\\\\").replace('"""', '\\"\\"\\"')
     escaped = re.sub(r"[\x00-\x08\x0b-\x1f\x7f]", lambda match: f"\\u{ord(match[0]):04x}", escaped)
     return f'"""\n{escaped}\n"""'
 
 
 def file_name(text: str) -> str:
-    """Return a text with hyphens for characters that are not suitable for a task's name."""
+    """Return a text with hyphens in place of the characters that a task's name may not have."""
     return re.sub(r"[^\w.\-]+", "-", text)
 
 

@@ -22,7 +22,7 @@ from lare_rl.new_task.many_agents import make_stub, write_team_drafts
 __all__ = ["draft_jax_task"]
 
 FIELD = re.compile(r"^- (observation|action|reward|episode termination|state)s?:", re.MULTILINE)
-"""The beginning of a section in Jumanji's documentation."""
+"""The start of a section in Jumanji's documentation."""
 
 
 def draft_jax_task(environment_id: str) -> Draft:
@@ -46,8 +46,8 @@ def draft_jax_task(environment_id: str) -> Draft:
         return write_team_drafts(file_name(name), environment_id, env, texts, removed, limit_lines)
     name, sizes = file_name(name), (env.spec.observation_size, env.spec.action_size)
     lines = [*draft.head_lines(name, environment_id, sizes, removed), draft.SCORE_LINE, *limit_lines]
-    first_lines = {"observation": _describe_observation(env, family), "action": _describe_action(env.spec)}
-    return draft.make_draft(name, lines, texts, first_lines, removed)
+    space_descriptions = {"observation": _describe_observation(env, family), "action": _describe_action(env.spec)}
+    return draft.make_draft(name, lines, texts, space_descriptions, removed)
 
 
 def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
@@ -55,13 +55,13 @@ def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
     documentation = inspect.cleandoc(vars(type(env.env)).get("__doc__") or "")
     sections = split_sections(FIELD.sub(_heading, documentation))
     lines = single_agent_lines(sections)
-    # The mask of available actions is no entry of the observation.
+    # The mask of available actions is not in the observation.
     rows = [line for line in lines["observation"] if "action_mask" not in line and not line.startswith("Observation")]
     return write_texts(lines | {"observation": rows}, sections)
 
 
 def _heading(match: re.Match[str]) -> str:
-    """Return a heading in place of the beginning of a section."""
+    """Return a section's heading in Markdown."""
     lead = "An episode ends:\n" if match[1] == "episode termination" else ""
     return f"## {match[1]}\n{lead}"
 

@@ -22,12 +22,12 @@ from lare_rl.tasks.spec import TaskSpec, split_environment
 __all__ = ["draft_multi_agent_task", "make_stub", "write_team_drafts"]
 
 GENERIC_MAKERS = ("parallel_env", "env", "raw_env")
-"""Common names of functions that make environments. For these, the draft is named after the module."""
+"""Names of functions that say nothing about the environment. Its draft is named after the module."""
 
 IRRELEVANT = re.compile(
     r"^(This environment is part of|Please read that page)|\bobservations?( space)?: |\baction space: "
 )
-"""Lines of a description that belong to other keys, or to none."""
+"""Lines of documentation that do not belong to the description."""
 
 TEAM_KEYS = ("observation", "action")
 """The texts that differ from team to team."""
@@ -38,8 +38,8 @@ TEAMS_COMMENT = [
 
 
 @runtime_checkable
-class Layouts(Protocol):
-    """An environment of many agents, which has a layout of its arrays."""
+class MultiAgentEnv(Protocol):
+    """An environment with the layout of its agents' arrays: `ParallelHost` and, in JAX, `JaxMARLEnv`."""
 
     spec: EnvSpec
     layout: AgentArrays
@@ -66,24 +66,24 @@ def draft_multi_agent_task(environment_id: str) -> Draft:
 def write_team_drafts(
     name: str,
     environment_id: str,
-    env: Layouts,
+    env: MultiAgentEnv,
     texts: dict[str, str],
     removed: tuple[str, ...],
     more_lines: Sequence[str] = (),
 ) -> Draft:
-    """Write a task file, which has `more_lines`, and, if there are several teams, a file for each of them.
+    """Draft a task file with `more_lines` and, if there are several teams, a file for each of them.
 
-    `env` is the environment, made for a task with these teams, and `removed` are the lines that were removed from the texts.
+    `env` is the environment, made for a task with these teams. `removed` are the lines that were removed from the texts.
     """
     teams, sizes = env.spec.teams, (env.spec.observation_size, env.spec.action_size)
     task_lines = [*draft.head_lines(name, environment_id, sizes, removed), draft.SCORE_LINE, *more_lines]
     if len(teams) == 1:
-        return draft.make_draft(name, task_lines, texts, _first_lines(env, teams[0]), removed)
+        return draft.make_draft(name, task_lines, texts, _describe_spaces(env, teams[0]), removed)
     files = {}
     for team in teams:
         team_name = file_name(team.name)
         lines = [*draft.head_lines(team_name, environment_id, sizes, removed), *_team_lines(env, team)]
-        team_draft = draft.make_draft(name, lines, _team_texts(env, team, texts), _first_lines(env, team), removed)
+        team_draft = draft.make_draft(name, lines, _team_texts(env, team, texts), _describe_spaces(env, team), removed)
         files[f"{name}-{team_name}.toml"] = team_draft.toml
     task_lines += [*TEAMS_COMMENT, f"teams = {json.dumps(list(files))}"]
     task_texts = texts | dict.fromkeys(TEAM_KEYS, "See the teams.")
@@ -92,10 +92,7 @@ def write_team_drafts(
 
 
 def make_stub(name: str, environment: str, agents: Iterable[Any] = (), **keys: Any) -> TaskSpec:
-    """Return a task that only has teams, of the kinds of agents with these names.
-
-    Its sizes are placeholders, because the draft must determine them first.
-    """
+    """Return a task with placeholders for sizes and texts, only to make its environment, and with a team for each kind of agents."""
 
     def stub(name: str, **keys: Any) -> TaskSpec:
         texts = dict.fromkeys(("description", "observation", "action"), "-")
@@ -125,21 +122,21 @@ def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
     about = plain_lines("\n".join(rows))
     lines = {"description": [line for line in about if not IRRELEVANT.search(line)]}
     for key in TEAM_KEYS:
-        section = first_section(sections, f"{key} space", key, f"{key}s")
-        lines[key] = section or [line for line in about if re.search(rf"\b{key}s?( space)?: ", line)]
+        mentions = [line for line in about if re.search(rf"\b{key}s?( space)?: ", line)]
+        lines[key] = first_section(sections, key) or mentions
     return write_texts(lines, sections)
 
 
-def _team_lines(host: Layouts, team: Team) -> list[str]:
-    names = [str(agent.name) for agent in host.layout.agents[team.agents]]
+def _team_lines(env: MultiAgentEnv, team: Team) -> list[str]:
+    names = [str(agent.name) for agent in env.layout.agents[team.agents]]
     patterns = [pattern for pattern in _name_patterns(team.name) if any(fnmatchcase(name, pattern) for name in names)]
     keys = {"team": team.name, "agents": patterns}
     return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in keys.items()]
 
 
-def _team_texts(host: Layouts, team: Team, texts: Mapping[str, str]) -> dict[str, str]:
+def _team_texts(env: MultiAgentEnv, team: Team, texts: Mapping[str, str]) -> dict[str, str]:
     """Return the texts of a team: the lines that do not begin with the name of another team."""
-    other_teams = {other.name for other in host.spec.teams} - {team.name}
+    other_teams = {other.name.lower() for other in env.spec.teams} - {team.name.lower()}
     team_texts = dict(texts)
     for key in TEAM_KEYS:
         lines = texts[key].splitlines()
@@ -149,20 +146,19 @@ def _team_texts(host: Layouts, team: Team, texts: Mapping[str, str]) -> dict[str
     return team_texts
 
 
-def _first_lines(host: Layouts, team: Team) -> dict[str, str]:
+def _describe_spaces(env: MultiAgentEnv, team: Team) -> dict[str, str]:
     """Return the descriptions of the spaces of a team's first agent, with the padding that other agents require."""
-    agent, spec = host.layout.agents[team.start], host.spec
-    flattening, padding = draft.describe_flattening(agent.observation_space), _describe_padding(host, agent)
-    fewer = f"; {agent.name} has only the first {agent.action_size}"
-    missing_actions = fewer if agent.discrete and agent.action_size < spec.action_size else ""
+    agent, spec = env.layout.agents[team.start], env.spec
+    flattening, padding = draft.describe_flattening(agent.observation_space), _describe_padding(env.layout, agent)
+    has_fewer_actions = agent.discrete and agent.action_size < spec.action_size
+    limit = f"; {agent.name} has only the first {agent.action_size}" if has_fewer_actions else ""
     return {
         "observation": f"{count_entries(spec.observation_size)}{flattening}{padding}.",
-        "action": f"{count_entries(spec.action_size)}{draft.describe_action(agent.action_space)}{missing_actions}.",
+        "action": f"{count_entries(spec.action_size)}{draft.describe_action(agent.action_space)}{limit}.",
     }
 
 
-def _describe_padding(host: Layouts, agent: Agent) -> str:
-    layout = host.layout
+def _describe_padding(layout: AgentArrays, agent: Agent) -> str:
     if not layout.adds_index:
         return ""
     n_zeros = layout.longest_observation - agent.observation_size
@@ -172,7 +168,7 @@ def _describe_padding(host: Layouts, agent: Agent) -> str:
 
 
 def _default_arguments(env: Any) -> str:
-    """Return the arguments of the environment's class that TOML can represent, as a table."""
+    """Return the default arguments of the environment's class that TOML can represent, as the entries of a table."""
     try:
         signature = inspect.signature(type(getattr(env, "unwrapped", env)).__init__)
     except (TypeError, ValueError):

@@ -9,25 +9,14 @@ from lare_rl.envs.families import FAMILIES
 from lare_rl.envs.gymnasium_env import make_gymnasium
 from lare_rl.errors import LareError
 from lare_rl.new_task import draft
-from lare_rl.new_task.documentation import single_agent_lines, split_sections, write_texts
+from lare_rl.new_task.documentation import single_agent_lines, split_sections, unused_titles, write_texts
 from lare_rl.new_task.draft import Draft, count_entries, file_name
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX
 
 __all__ = ["draft_task"]
 
 JAX_FAMILIES = ("gymnax", "brax", "playground", "jumanji", "jaxmarl")
-"""Families whose environments are functions of JAX. Their drafts are written by a module that imports JAX."""
-
-USED_TITLES = {
-    "",
-    "description",
-    "observation space",
-    "observation",
-    "action space",
-    "action",
-    "episode end",
-    "episode termination",
-}
+"""Families of packages in JAX."""
 
 
 def draft_task(environment_id: str) -> Draft:
@@ -55,15 +44,14 @@ def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
     sections = split_sections(type(env.unwrapped).__doc__ or "")
     texts, removed = write_texts(single_agent_lines(sections), sections)
     observation_size, action_size = (int(flatdim(space)) for space in (env.observation_space, env.action_space))
-    flattening = draft.describe_flattening(env.observation_space)
-    first_lines = {
-        "observation": f"{count_entries(observation_size)}{flattening}.",
+    space_descriptions = {
+        "observation": f"{count_entries(observation_size)}{draft.describe_flattening(env.observation_space)}.",
         "action": f"{count_entries(action_size)}{draft.describe_action(env.action_space)}.",
     }
     # An id without a version means the latest version, which may change later.
     module, colon, name = environment_id.rpartition(":")
     full_id = f"{module}{colon}{env.spec.id}" if env.spec else environment_id
-    unused = tuple(title for title, body in sections.items() if title not in USED_TITLES and body.strip())
+    unused = unused_titles(sections)
     lines = [
         *draft.head_lines(file_name(name), full_id, (observation_size, action_size), removed, unused),
         draft.SCORE_LINE,
@@ -72,4 +60,4 @@ def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
     ]
     if not (env.spec and env.spec.max_episode_steps):
         lines.append(draft.LIMIT_LINE)
-    return draft.make_draft(file_name(name), lines, texts, first_lines, removed, unused_sections=unused)
+    return draft.make_draft(file_name(name), lines, texts, space_descriptions, removed, unused_sections=unused)

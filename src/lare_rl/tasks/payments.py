@@ -24,13 +24,15 @@ class PaymentRule:
 
     @property
     def for_scores(self) -> "PaymentRule":
-        """When an episode is paid whose score alone is known: once, at its end. `window` stands only if there is no other payment."""
+        """The rule for an episode of which only the score is known: it is paid once, at its end.
+
+        `window` is kept only if the environment pays once, too. Otherwise it is that of earlier payments.
+        """
         return PAID_AT_END if self.nonzero or self.period is not None else self
 
     def longest_segment(self, max_steps: int) -> int:
         """Return the largest number of steps that a payment is for, in episodes of at most `max_steps` steps."""
-        longest = min(max_steps, self.period or max_steps) if self.window is None else self.window
-        return min(max_steps, longest)
+        return min(max_steps, self.window or self.period or max_steps)
 
     def is_regular(self, max_steps: int) -> bool:
         """Whether all payments of an episode of `max_steps` steps are for the same number of steps."""

@@ -35,33 +35,6 @@ input `scored_observation` is then both observations."""
 
 State = TypeVar("State")
 
-
-def select_states(scored_observation: ScoredObservation, state: State, next_state: State) -> list[State]:
-    """Return the states of a step that `phi` reads, in the order in which factors are concatenated."""
-    return {"before": [state], "after": [next_state], "both": [state, next_state]}[scored_observation]
-
-
-def step_names(scored_observation: ScoredObservation, names: Sequence[str]) -> list[str]:
-    """Return the names of the values that are computed from `select_states`.
-
-    For both states, each name occurs twice: first all as in `speed (before)`, then all as in `speed (after)`.
-    """
-    if scored_observation != "both":
-        return list(names)
-    return [f"{name} ({side})" for side in ("before", "after") for name in names]
-
-
-def base_name(step_name: str) -> str:
-    """Return the name without what `step_names` adds."""
-    return step_name.removesuffix(" (before)").removesuffix(" (after)")
-
-
-def entry_meanings(text: str) -> dict[int, str]:
-    """Return the meanings of the entries of an observation or action by its text: the line `7: angle of the foot` is about entry 7."""
-    lines = re.findall(r"^[ \t\-*\[]*(\d+)\]?[ \t]*[:.)](?!\d)[ \t]*(\S.*)$", text, flags=re.MULTILINE)
-    return {int(number): meaning.strip() for number, meaning in lines}
-
-
 CreditScope = Literal["observation", "state"]
 """See `TaskSpec.credit_scope`."""
 
@@ -84,14 +57,6 @@ SHARED_KEYS = (
 """Keys that a team inherits from its task. The team's own file may repeat them, so that it can be used alone, but with the same
 values."""
 
-
-class PaidSteps(CheckedModel):
-    """The value of `paid_for` if each payment is for a fixed number of steps."""
-
-    steps: Annotated[StrictInt, Field(ge=1)]
-    """A payment is for this many of the last steps."""
-
-
 MAX_LEVELS = 64
 """The number of levels that `group` may tell apart."""
 
@@ -100,6 +65,13 @@ NO_ENVIRONMENT = "none"
 
 FILL_IN = "FILL IN"
 """The placeholder in a draft for texts that must be written before a language model reads them."""
+
+
+class PaidSteps(CheckedModel):
+    """The value of `paid_for` if each payment is for a fixed number of steps."""
+
+    steps: Annotated[StrictInt, Field(ge=1)]
+    """A payment is for this many of the last steps."""
 
 
 class TaskSpec(CheckedModel):
@@ -233,6 +205,32 @@ class TaskSpec(CheckedModel):
     def digest(self) -> str:
         """SHA-256 of all values."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
+
+
+def select_states(scored_observation: ScoredObservation, state: State, next_state: State) -> list[State]:
+    """Return the states of a step that `phi` reads, in the order in which factors are concatenated."""
+    return {"before": [state], "after": [next_state], "both": [state, next_state]}[scored_observation]
+
+
+def step_names(scored_observation: ScoredObservation, names: Sequence[str]) -> list[str]:
+    """Return the names of the values that are computed from `select_states`.
+
+    For both states, each name occurs twice: first all as in `speed (before)`, then all as in `speed (after)`.
+    """
+    if scored_observation != "both":
+        return list(names)
+    return [f"{name} ({side})" for side in ("before", "after") for name in names]
+
+
+def base_name(step_name: str) -> str:
+    """Return the name without what `step_names` adds."""
+    return step_name.removesuffix(" (before)").removesuffix(" (after)")
+
+
+def entry_meanings(text: str) -> dict[int, str]:
+    """Return the meanings of the entries of an observation or action by its text: the line `7: angle of the foot` is about entry 7."""
+    lines = re.findall(r"^[ \t\-*\[]*(\d+)\]?[ \t]*[:.)](?!\d)[ \t]*(\S.*)$", text, flags=re.MULTILINE)
+    return {int(number): meaning.strip() for number, meaning in lines}
 
 
 def split_environment(name: str) -> tuple[str, str]:

@@ -31,10 +31,10 @@ _own_environments = set[str]()
 
 def trust_environment(task: TaskSpec) -> None:
     """Trust the environment of a task that the user has given to this process, in all files that it reads later."""
-    _own_environments.update(_names(task))
+    _own_environments.update(_environments(task))
 
 
-def _names(task: TaskSpec) -> set[str]:
+def _environments(task: TaskSpec) -> set[str]:
     return {task.environment, task.evaluation_task.environment}
 
 
@@ -44,7 +44,7 @@ def trusted_modules() -> list[str]:
 
 
 def module_to_trust(task: TaskSpec) -> str | None:
-    """Return the module of a task's environment that a new process would not import for a report. None if there is none."""
+    """Return the module of a task's environment if `LARE_TRUST` must name it before a new process imports it for a report."""
     module, _ = split_environment(task.environment)
     return module if module and module not in trusted_modules() else None
 
@@ -53,28 +53,24 @@ def untrusted_module(task: TaskSpec) -> str | None:
     """Return the module of a task's environment, if a report must not import it, else None.
 
     That is a module that the user does not trust, of a task that the user has not given to this process. A module that the process
-    has imported already may be used. PettingZoo's environments are made by a function that the task names: it must be known too.
+    has imported already may be used, but no unknown function of it.
     """
     module = module_to_trust(task)
-    names = _names(task)
-    if module is None or names <= _own_environments:
+    environments = _environments(task)
+    if module is None or environments <= _own_environments:
         return None
-    return None if module in sys.modules and all(map(_makes_environment, names)) else module
+    return None if module in sys.modules and not any(map(_calls_unknown_function, environments)) else module
 
 
-def _makes_environment(name: str) -> bool:
-    """Return whether the name is not PettingZoo's, or is of a function that is known to make an environment."""
-    module, function = split_environment(name)
-    if not name.startswith(PETTINGZOO_PREFIX):
-        return True
-    return module.partition(".")[0] in _PETTINGZOO_PACKAGES and function == "parallel_env"
+def _calls_unknown_function(environment: str) -> bool:
+    """Return whether an environment is PettingZoo's, and made by a function that may also do something else."""
+    module, function = split_environment(environment)
+    is_known = module.partition(".")[0] in _PETTINGZOO_PACKAGES and function == "parallel_env"
+    return environment.startswith(PETTINGZOO_PREFIX) and not is_known
 
 
 def check_trusted(task: TaskSpec, directory: Path) -> None:
-    """Raise `LareError` unless the module of a run's environment is installed, or trusted by the user.
-
-    Of PettingZoo's, the function must also be known to make environments.
-    """
+    """Raise `LareError` unless the user trusts the module of a run's environment, or it is installed and no unknown function is called."""
     module = untrusted_module(task)
     if module is None:
         return
@@ -82,7 +78,7 @@ def check_trusted(task: TaskSpec, directory: Path) -> None:
     foreign = [path for path in _package_paths(module) if not any(map(path.is_relative_to, folders))]
     if foreign:
         reason = f"run {foreign[0]}, which is in no folder of installed packages"
-    elif not all(map(_makes_environment, _names(task))):
+    elif any(map(_calls_unknown_function, _environments(task))):
         reason = f"call a function of {module}"
     else:
         return
@@ -100,9 +96,7 @@ def _package_paths(module: str) -> list[Path]:
         return []
     if spec is None or spec.origin in ("built-in", "frozen"):
         return []
-    paths = (
-        [spec.origin] if spec.origin else list(spec.submodule_search_locations or ())
-    )  # a namespace may have several
+    paths = [spec.origin] if spec.origin else spec.submodule_search_locations or ()  # a namespace may have several
     return [Path(path).resolve() for path in paths]
 
 

@@ -9,18 +9,22 @@ import numpy as np
 from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
-from lare_rl.errors import LareError, short_repr
-from lare_rl.turns import trust as trust_rules
+from lare_rl.errors import LareError, check_count, short_repr
 from lare_rl.turns.features import COUNT, HAPPENED, LAST, Prefixes, TurnTable, build_prefixes, tabulate
 from lare_rl.turns.regression import PrefixFit
 from lare_rl.turns.rollouts import Phi, read_rollouts
-from lare_rl.turns.trust import UNTRUSTED, Errors, Trust
+from lare_rl.turns.trust import UNTRUSTED, Errors, Trust, choose_lambda, group_means, measure_errors, summarise
 from lare_rl.turns.value import advantages, changes, fit_prefixes, held_out_values, posterior_stds, values
 from lare_rl.turns.words import MESSAGES, count_decimals
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import CLEAR_ERRORS
 
-__all__ = ["CreditedTurns", "FeatureEffect", "TurnCredit"]
+__all__ = ["EFFECT_KINDS", "CreditedTurns", "FeatureEffect", "TurnCredit"]
+
+MAX_SENTENCES = 8
+"""The largest number of features that are described in words."""
+EFFECT_KINDS = {"first": (COUNT, HAPPENED, LAST), "lasting": (COUNT, HAPPENED), "further": (COUNT,)}
+"""For each effect of a feature (see `FeatureEffect`), the kinds of the features of prefixes whose weights add up to it."""
 
 TurnValues = list[Float[np.ndarray, " _"]]
 """One array for each rollout, with one number for each of its turns."""
@@ -29,19 +33,19 @@ TurnValues = list[Float[np.ndarray, " _"]]
 class FeatureEffect(NamedTuple):
     """How a feature of a turn changes the value, in the unit of outcomes (of log odds if values are logistic).
 
-    The feature is taken to be `unit`. Each effect has its posterior standard deviation.
+    Each effect is that of a feature of the size `unit`, and has its posterior standard deviation.
     """
 
     name: str
     unit: float
     """The mean of the feature in the turns where it is not 0."""
     frequency: float
-    """The share of these turns."""
+    """The share of the turns where it is not 0."""
     first: float
     """The change of value by the first turn with the feature."""
     first_std: float
     lasting: float
-    """What remains of it after further turns without the feature."""
+    """What remains of this change after further turns without the feature."""
     lasting_std: float
     further: float
     """What each further turn with the feature adds."""
@@ -49,7 +53,7 @@ class FeatureEffect(NamedTuple):
 
     @property
     def importance(self) -> float:
-        """The mean size of its first effect over all turns."""
+        """The mean of |`first`| over all turns, with 0 where the feature is 0."""
         return abs(self.first * self.frequency)
 
 
@@ -70,7 +74,7 @@ class CreditedTurns:
     trust: Trust
     """The gain, its standard error, and the surprise at the end, over the latest calls."""
     effects: tuple[FeatureEffect, ...]
-    """Of each feature of a turn."""
+    """One for each feature of a turn."""
     is_logistic: bool
     """Whether the effects are changes of log odds."""
     reason: Finding
@@ -78,7 +82,7 @@ class CreditedTurns:
 
     @property
     def is_grpo(self) -> bool:
-        """Whether the values are not trusted at all, and the advantage is GRPO's: the outcome minus the mean of the group."""
+        """Whether the values are not trusted, and the advantage is GRPO's: the outcome minus the mean of the group."""
         return self.reason.code in UNTRUSTED
 
     @property
@@ -93,7 +97,7 @@ class CreditedTurns:
 
     @property
     def words(self) -> list[str]:
-        """What lambda was used and why, and the features that matter most, as sentences."""
+        """Sentences: which lambda was used and why, and the effects of the features that matter most."""
         return [render(finding, MESSAGES) for finding in self.findings]
 
     @property
@@ -101,24 +105,20 @@ class CreditedTurns:
         """The same as findings, whose sentences are in `turns/words.py`."""
         clear = [effect for effect in self.effects if abs(effect.first) > CLEAR_ERRORS * effect.first_std]
         clear.sort(key=lambda effect: -effect.importance)
-        form = {
-            "target": "log odds" if self.is_logistic else "value",
-            "decimals": count_decimals(self.trust.outcome_std),
-        }
+        target, decimals = "log odds" if self.is_logistic else "value", count_decimals(self.trust.outcome_std)
         return [
             Finding("grpo" if self.is_grpo else "lambda", {"lambda_": self.lambda_, "reason": self.reason}),
-            *(Finding("effect", effect._asdict() | form) for effect in clear[:MAX_SENTENCES]),
+            *(
+                Finding("effect", {**effect._asdict(), "target": target, "decimals": decimals})
+                for effect in clear[:MAX_SENTENCES]
+            ),
         ]
-
-
-MAX_SENTENCES = 8
-"""The largest number of features that are described in words."""
 
 
 class TurnCredit:
     """Gives credit to the turns of agents, from the outcomes of their rollouts.
 
-    The values of prefixes are fitted anew to the rollouts of each call. Only their errors are remembered, for some calls.
+    Each call fits the values of prefixes anew, to its own rollouts. Only the errors of the last `window` calls are remembered.
     """
 
     def __init__(
@@ -127,9 +127,9 @@ class TurnCredit:
         """Make an object that has seen no rollouts.
 
         Args:
-            lambda_: of generalized advantages, 0 to 1. If it is None, it follows from the trust in the values: 0.8, 0.95 or 1.
+            lambda_: of generalized advantages, 0 to 1. None: the trust in the values decides between 0.8, 0.95 and 1.
             window: the number of calls over which trust is measured.
-            logistic: whether the log odds are linear in the features, instead of the value. Outcomes must be between 0 and 1.
+            logistic: whether the log odds of outcomes are linear in the features, and not the value. Outcomes are then 0 to 1.
             phi: a function from a turn to numbers with names, such as `load_turn_phi` reads. It needs rollouts with messages.
 
         Raises:
@@ -137,9 +137,7 @@ class TurnCredit:
         """
         if lambda_ is not None and not (isinstance(lambda_, int | float) and 0 <= lambda_ <= 1):
             raise LareError(f"lambda_ must be None or a number from 0 to 1, and is {short_repr(lambda_)}")
-        if not isinstance(window, int) or window < 1:
-            raise LareError(f"window must be a whole number of calls, at least 1, and is {short_repr(window)}")
-        self.lambda_, self.window, self.logistic, self.phi = lambda_, window, logistic, phi
+        self.lambda_, self.window, self.logistic, self.phi = lambda_, check_count("window", window), logistic, phi
         self._errors: tuple[Errors, ...] = ()
 
     def __call__(self, rollouts: Iterable[Any]) -> CreditedTurns:
@@ -168,14 +166,14 @@ class TurnCredit:
         fit = fit_prefixes(table, x, is_logistic=self.logistic)
         value = values(table, x, fit)
         progress = changes(table, value)
-        errors = trust_rules.measure_errors(table, held_out_values(table, x, fit))
+        errors = measure_errors(table, held_out_values(table, x, fit))
         self._errors = (*self._errors, errors)[-self.window :]
-        trust = trust_rules.summarise(self._errors)
-        lambda_, reason = trust_rules.choose_lambda(trust)
+        trust = summarise(self._errors)
+        lambda_, reason = choose_lambda(trust)
         if self.lambda_ is not None:
             lambda_, reason = self.lambda_, Finding("chosen", {"measured": reason})
         if reason.code in UNTRUSTED:
-            advantage = (table.outcome - trust_rules.group_means(table))[table.rollout_index]
+            advantage = (table.outcome - group_means(table))[table.rollout_index]
         else:
             advantage = advantages(table, progress, lambda_)
         split = partial(np.split, indices_or_sections=table.first[1:])
@@ -193,16 +191,17 @@ class TurnCredit:
 
 
 def _describe_effects(table: TurnTable, prefixes: Prefixes, fit: PrefixFit) -> tuple[FeatureEffect, ...]:
-    """Return the effect of each feature of a turn, from the weights of its count, its indicator and its last value."""
+    """Return the effect of each feature of a turn."""
     effects = []
     for i, name in enumerate(table.names):
         column = table.features[:, i]
         is_nonzero = column != 0
         unit = float(column[is_nonzero].mean()) if is_nonzero.any() else 1.0
         size = np.where(prefixes.kind == HAPPENED, 1.0, unit) * (prefixes.feature_index == i)
-        numbers = []
-        for kinds in ((COUNT, HAPPENED, LAST), (COUNT, HAPPENED), (COUNT,)):
+        numbers = {}
+        for effect, kinds in EFFECT_KINDS.items():
             row = size * np.isin(prefixes.kind, kinds)
-            numbers += [float(row @ fit.weight), float(np.linalg.norm(fit.root[:, :-1] @ row))]
-        effects.append(FeatureEffect(name, unit, float(is_nonzero.mean()), *numbers))
+            numbers[effect] = float(row @ fit.weight)
+            numbers[f"{effect}_std"] = float(np.linalg.norm(fit.root[:, :-1] @ row))
+        effects.append(FeatureEffect(name=name, unit=unit, frequency=float(is_nonzero.mean()), **numbers))
     return tuple(effects)

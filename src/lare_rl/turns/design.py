@@ -1,6 +1,7 @@
-"""Asks a language model for a phi over turns: the request, one attempt, and corrections until it passes."""
+"""Asks a language model for a phi over turns, and for corrections until it passes."""
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -21,7 +22,7 @@ from lare_rl.util.sanitize import replace_surrogates
 __all__ = ["DesignedTurnPhi", "choose_examples", "design_turn_phi", "turn_request"]
 
 N_EXAMPLES = 5
-"""The number of turns that the language model sees."""
+"""The largest number of turns that the language model sees."""
 MAX_EXCERPT = 1500
 """Characters of a text of an example."""
 
@@ -32,7 +33,9 @@ class DesignedTurnPhi:
 
     phi: TurnPhi
     model: str
+    """The name of the language model."""
     recorder: Recorder
+    """The requests and the replies."""
 
 
 def design_turn_phi(
@@ -49,7 +52,7 @@ def design_turn_phi(
     Args:
         goal: what the agent is to do.
         tools: the descriptions of its tools, in the form of OpenAI's chat completions.
-        turns: turns that programs are checked on, such as all of some rollouts (`split_turns`).
+        turns: the turns that programs are checked on, such as those of some rollouts (`split_turns`).
         model: the language model, as for `lare_rl.design`.
         examples: the turns that the model sees. The default is five of `turns`, of different tools.
         record: the file to which every exchange is written.
@@ -78,7 +81,7 @@ def design_turn_phi(
 
 
 def turn_request(goal: str, tools: Sequence[Mapping[str, Any]], turns: Sequence[Turn]) -> list[Message]:
-    """Return the messages that ask for a phi over turns, with example turns. The same arguments always give the same request.
+    """Return the messages that ask for a phi over turns, with example turns. They do not vary, so that replies can be recorded.
 
     Raises:
         LareError: a tool has no name, or parameters that are not JSON.
@@ -90,18 +93,20 @@ def turn_request(goal: str, tools: Sequence[Mapping[str, Any]], turns: Sequence[
     return [{"role": "system", "content": system}, {"role": "user", "content": replace_surrogates(user)}]
 
 
-def choose_examples(turns: Sequence[Turn], n_examples: int = N_EXAMPLES) -> list[Turn]:
-    """Return turns with new results, taking the tools in turn. They keep their order."""
-    ranks, counts, results = [], {}, set()
+def choose_examples(turns: Sequence[Turn]) -> list[Turn]:
+    """Return at most `N_EXAMPLES` turns in their order: the first with each combination of tools, then the second, and so on.
+
+    Turns whose results are those of an earlier turn are left out.
+    """
+    ranks, counts, results = [], Counter(), set()
     for index, turn in enumerate(turns):
-        tools = tuple(call.tool for call in turn.calls)
-        answer = tuple(call.result for call in turn.calls) or (turn.reply,)
-        if answer in results:
-            continue
-        results.add(answer)
-        counts[tools] = counts.get(tools, 0) + 1
-        ranks.append((counts[tools], index))
-    return [turns[index] for index in sorted(index for _, index in sorted(ranks)[:n_examples])]
+        result = tuple(call.result for call in turn.calls) or (turn.reply,)
+        if result not in results:
+            results.add(result)
+            tools = tuple(call.tool for call in turn.calls)
+            counts[tools] += 1
+            ranks.append((counts[tools], index))
+    return [turns[index] for index in sorted(index for _, index in sorted(ranks)[:N_EXAMPLES])]
 
 
 def _show_tool(tool: Mapping[str, Any]) -> str:

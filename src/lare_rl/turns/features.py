@@ -21,7 +21,6 @@ __all__ = ["COUNT", "HAPPENED", "LAST", "TIME", "Prefixes", "TurnTable", "build_
 COUNT, HAPPENED, LAST, TIME = range(4)
 """The kinds of a prefix's features: sums, indicators, last values, and t and t^2."""
 
-
 MAX_FEATURES = 100
 """The largest number of features of a turn, in all rollouts of a call together. Language models invent names of tools."""
 
@@ -62,16 +61,12 @@ def tabulate(rollouts: Sequence[Rollout]) -> TurnTable:
     """
     counts = Counter(name for rollout in rollouts for turn in rollout.turns for name, value in turn.items() if value)
     names = tuple(sorted(name for name, _ in counts.most_common(MAX_FEATURES)))
-    column = {name: index for index, name in enumerate(names)}
+    columns = {name: column for column, name in enumerate(names)}
     length = np.array([len(rollout.turns) for rollout in rollouts])
     features = np.zeros((length.sum(), len(names)))
-    row = 0
-    for rollout in rollouts:
-        for turn in rollout.turns:
-            for name, value in turn.items():
-                if name in column:
-                    features[row, column[name]] = value
-            row += 1
+    for row, turn in enumerate(turn for rollout in rollouts for turn in rollout.turns):
+        for name in turn.keys() & columns.keys():
+            features[row, columns[name]] = turn[name]
     return TurnTable(
         names=names,
         features=features,
@@ -87,8 +82,9 @@ class Prefixes(NamedTuple):
 
     features: Float[np.ndarray, "turns prefix_features"]
     feature_index: Int[np.ndarray, " prefix_features"]
-    """The index of the turn's feature in `TurnTable.names`, or -1 for t and t^2."""
+    """The index in `TurnTable.names` of the feature of a turn from which it is computed, or -1 for t and t^2."""
     kind: Int[np.ndarray, " prefix_features"]
+    """`COUNT`, `HAPPENED`, `LAST` or `TIME`."""
 
 
 def build_prefixes(table: TurnTable) -> Prefixes:
@@ -106,7 +102,7 @@ def build_prefixes(table: TurnTable) -> Prefixes:
 
 
 def _sum_within(values: Float[np.ndarray, "turns features"], table: TurnTable) -> Float[np.ndarray, "turns features"]:
-    """Return the sums of the rows of a rollout up to and with each row."""
+    """Return the cumulative sum of the rows of each rollout."""
     sums = np.cumsum(values, axis=0)
     before = sums[table.first] - values[table.first]
     return sums - np.repeat(before, table.length, axis=0)

@@ -1,20 +1,22 @@
 """Files of rollouts: one JSON object in each line, and the same with the credit of each turn."""
 
 import json
-from itertools import count
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from lare_rl.errors import LareError
 from lare_rl.turns.credit import CreditedTurns
 from lare_rl.util.files import write_bytes
-from lare_rl.util.safe_io import read_json, read_text
+from lare_rl.util.safe_io import read_json, read_json_object, read_text
+from lare_rl.util.sanitize import one_line
 
 __all__ = ["MAX_LINE_BYTES", "read_rollout_file", "read_tool_file", "write_credit_file"]
 
 MAX_LINE_BYTES = 64 << 20
 """The largest size of a rollout."""
-DIGITS = 6
+DECIMALS = 6
+"""Decimal places of the numbers that are written."""
 
 
 def read_rollout_file(path: Path) -> list[dict[str, Any]]:
@@ -28,10 +30,7 @@ def read_rollout_file(path: Path) -> list[dict[str, Any]]:
         if path.exists() and not path.is_file():
             raise LareError(f"{path} is not a file")
         with path.open("rb") as file:
-            for number in count(1):
-                line = file.readline(MAX_LINE_BYTES + 1)
-                if not line:
-                    break
+            for number, line in enumerate(iter(partial(file.readline, MAX_LINE_BYTES + 1), b""), start=1):
                 if len(line) > MAX_LINE_BYTES:
                     raise LareError(f"{path}, line {number}: it is larger than {MAX_LINE_BYTES >> 20} MB")
                 if line.strip():
@@ -45,12 +44,11 @@ def read_rollout_file(path: Path) -> list[dict[str, Any]]:
 
 def _read_line(line: bytes, where: str) -> dict[str, Any]:
     try:
-        value = read_json(line.decode("utf-8-sig"))
-    except ValueError as error:  # UnicodeDecodeError is one
-        raise LareError(f"{where} is not JSON: {' '.join(str(error).split())}") from None
-    if not isinstance(value, dict):
-        raise LareError(f"{where} is not a JSON object with messages or turns, and an outcome")
-    return value
+        return read_json_object(line.decode("utf-8-sig"))
+    except ValueError as error:  # UnicodeDecodeError is a subclass
+        raise LareError(
+            f"{where} is not a JSON object with messages or turns, and an outcome: {one_line(error)}"
+        ) from None
 
 
 def read_tool_file(path: Path) -> list[dict[str, Any]]:
@@ -62,7 +60,7 @@ def read_tool_file(path: Path) -> list[dict[str, Any]]:
     try:
         tools = read_json(read_text(path))
     except ValueError as error:
-        raise LareError(f"{path} is not JSON: {' '.join(str(error).split())}") from None
+        raise LareError(f"{path} is not JSON: {one_line(error)}") from None
     if not isinstance(tools, list) or not tools or not all(isinstance(tool, dict) for tool in tools):
         raise LareError(f"{path} is not a list of tools: the form is that of `tools` in OpenAI's chat completions")
     return tools
@@ -77,8 +75,7 @@ def write_credit_file(path: Path, rollouts: list[dict[str, Any]], credit: Credit
     lines = []
     for k, rollout in enumerate(rollouts):
         arrays = {name: getattr(credit, name)[k] for name in ("advantage", "progress", "deviation", "value")}
-        numbers = {name: [round(float(number), DIGITS) for number in array] for name, array in arrays.items()}
+        numbers = {name: [round(float(number), DECIMALS) for number in array] for name, array in arrays.items()}
         lines.append(json.dumps({**rollout, "credit": {**numbers, "lambda": credit.lambda_}}, ensure_ascii=False))
     # A text of a rollout may have half of a surrogate pair, which is valid in JSON, but not in UTF-8.
-    content = "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")
-    write_bytes(path, content)
+    write_bytes(path, "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace"))

@@ -1,4 +1,4 @@
-"""The same value of a prefix with a logistic likelihood, for outcomes between 0 and 1.
+"""The value of a prefix with a logistic likelihood, for outcomes between 0 and 1.
 
     P(R_k = 1) = s(eta),    eta = m + b_group(k) + v . x_kt,    s the logistic function
 
@@ -12,13 +12,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lare_rl.credit.precisions import NUMPY_BACKEND, TOLERANCE
-from lare_rl.turns.regression import GroupSums, PrefixFit, eliminate_groups, sum_up, to_fit
+from lare_rl.turns.regression import Elimination, GroupSums, PrefixFit, eliminate_groups, sum_up, to_fit
 
 __all__ = ["fit_logistic", "logistic"]
 
 MAX_ROUNDS = 25
+"""The largest number of rounds: of precisions, and Newton's steps under each of them."""
 FIRST_STEPS, NEXT_STEPS = 8, 2
-"""Newton's steps in the first round, and in each round after a change of the precisions."""
+"""The largest number of steps in the first round, and in each further one."""
 MAX_LOG_ODDS = 30.0
 MAX_STEP = 5.0
 """The largest change of the log odds of a prefix in one step."""
@@ -43,30 +44,36 @@ def fit_logistic(
     rate = np.clip(weight @ y / weight.sum(), 0.02, 0.98)
     eta = np.full(len(y), np.log(rate / (1 - rate)))
 
-    def regress() -> GroupSums:
+    def regress(eta: np.ndarray) -> GroupSums:
+        """Return the sums of the regression on the working response."""
         p = logistic(eta)
         curvature = np.maximum(p * (1 - p), MIN_CURVATURE)
         return sum_up(x, eta + (y - p) / curvature, weight * curvature, group, n_rollouts, unit=1.0)
 
-    sums = regress()
-    alpha_index = sums.problem.alpha_index
-    first = np.append(np.diagonal(sums.problem.s) / sums.problem.q * x.shape[1], 1.0) + 1e-12
-    alpha, previous, n_rounds, n_steps = first, -np.inf, 1, FIRST_STEPS
-    while True:
+    def newton(eta: np.ndarray, alpha: np.ndarray, max_steps: int) -> tuple[np.ndarray, GroupSums, Elimination]:
+        """Return the log odds after Newton's steps, with the sums and the posterior of the last step."""
+        sums = regress(eta)
         posterior = eliminate_groups(sums, alpha, 1.0)
         mean = sums.problem.y_mean + posterior.weight[-1]
         step = mean + (x - sums.x_mean) @ posterior.weight[:-1] + posterior.intercept[group] - eta
         largest = np.abs(step).max()
         eta = eta + step * min(1.0, MAX_STEP / max(largest, 1e-12))
-        n_steps -= 1
-        if largest < 1e-3 or not n_steps:
-            solution = np.concatenate([posterior.weight[:-1], posterior.intercept])
-            moments = solution, posterior.variance, posterior.log_det
-            _, next_alpha, log_occam = NUMPY_BACKEND.update_alpha(alpha_index, alpha, *moments)
-            p = np.clip(logistic(eta), 1e-12, 1 - 1e-12)
-            log_evidence = weight @ (y * np.log(p) + (1 - y) * np.log(1 - p)) + log_occam
-            if abs(log_evidence - previous) <= 10 * TOLERANCE or n_rounds == MAX_ROUNDS:
-                return to_fit(sums, posterior, 1.0, is_logistic=True)
-            previous, n_rounds, n_steps = log_evidence, n_rounds + 1, NEXT_STEPS
-            alpha = np.clip(next_alpha, first * WEAKEST, first * STRONGEST)
-        sums = regress()
+        if largest < 1e-3 or max_steps == 1:
+            return eta, sums, posterior
+        return newton(eta, alpha, max_steps - 1)
+
+    problem = regress(eta).problem
+    first_alpha = np.append(np.diagonal(problem.s) / problem.q * x.shape[1], 1.0) + 1e-12
+    alpha, log_evidence = first_alpha, -np.inf
+    eta, sums, posterior = newton(eta, alpha, FIRST_STEPS)
+    for _ in range(MAX_ROUNDS - 1):
+        solution = np.concatenate([posterior.weight[:-1], posterior.intercept])
+        moments = solution, posterior.variance, posterior.log_det
+        _, alpha, log_occam = NUMPY_BACKEND.update_alpha(problem.alpha_index, alpha, *moments)
+        alpha = np.clip(alpha, first_alpha * WEAKEST, first_alpha * STRONGEST)
+        p = np.clip(logistic(eta), 1e-12, 1 - 1e-12)
+        previous, log_evidence = log_evidence, weight @ (y * np.log(p) + (1 - y) * np.log(1 - p)) + log_occam
+        if abs(log_evidence - previous) <= 10 * TOLERANCE:
+            break
+        eta, sums, posterior = newton(eta, alpha, NEXT_STEPS)
+    return to_fit(sums, posterior, 1.0, is_logistic=True)

@@ -14,7 +14,7 @@ import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from lare_rl.errors import LareError, short_repr
 from lare_rl.util.safe_io import read_json
@@ -36,6 +36,7 @@ MAX_CALLS = 64
 """The largest number of calls in a turn."""
 MAX_TOOL_NAME = 60
 CHARACTERS_PER_TOKEN, TOKENS_UNIT = 4, 100
+"""The feature `tokens` is an estimate, in the unit of 100 tokens."""
 
 
 @dataclass(frozen=True)
@@ -86,41 +87,51 @@ def split_turns(messages: Any, where: str) -> list[Turn]:
     return [_read_turn(span, where) for span in spans]
 
 
+class _Result(NamedTuple):
+    """A tool's message."""
+
+    identifier: str | int | None
+    text: str
+    failed: bool
+
+
 def _read_turn(span: Sequence[tuple[int, Mapping[str, Any]]], where: str) -> Turn:
     i, message = span[0]
     calls = _read_calls(message, f"{where}: messages[{i}]")
-    results: dict[Any, tuple[str, bool]] = {}
-    replies = []
+    results, replies = [], []
     for j, answer in span[1:]:
         text = _read_text(answer.get("content"), f"{where}: messages[{j}]")
         if answer["role"] == "tool":
-            # Without an identifier, results are in the order of the calls.
-            key = answer.get("tool_call_id")
-            is_identifier = isinstance(key, str | int)
-            results[key if is_identifier else ("position", len(results))] = text, _failed(answer, text)
+            results.append(_Result(_read_identifier(answer.get("tool_call_id")), text, _failed(answer, text)))
         else:
             replies.append(text)
-    if len(calls) < len(results):
-        extra = len(results) - len(calls)
-        calls = [*calls, *[("unknown", "", None)] * extra]
-    unused = dict(results)
-    by_identifier = [unused.pop(identifier, None) if identifier is not None else None for _, _, identifier in calls]
-    rest, no_result = iter(unused.values()), ("", False)
-    matched: list[tuple[str, bool]] = [
-        result if result is not None else next(rest, no_result) for result in by_identifier
-    ]
+    calls += [(None, "unknown", "")] * (len(results) - len(calls))
+    matched = _match_results([identifier for identifier, _, _ in calls], results)
     return Turn(
         text=_read_text(message.get("content"), f"{where}: messages[{i}]"),
         calls=tuple(
-            Call(tool, arguments, result, failed)
-            for (tool, arguments, _), (result, failed) in zip(calls, matched, strict=True)
+            Call(tool, arguments, result.text, result.failed)
+            for (_, tool, arguments), result in zip(calls, matched, strict=True)
         ),
         reply="\n".join(replies),
     )
 
 
-def _read_calls(message: Mapping[str, Any], where: str) -> list[tuple[str, str, str | int | None]]:
-    """Return the name, the arguments and the identifier of each call of an assistant's message."""
+def _match_results(identifiers: Sequence[str | int | None], results: Sequence[_Result]) -> list[_Result]:
+    """Return the result of each call: that with its identifier, or else the next that has the identifier of no call."""
+    remaining = list(results)
+    matched = []
+    for identifier in identifiers:
+        same = (result for result in remaining if identifier is not None and result.identifier == identifier)
+        if result := next(same, None):
+            remaining.remove(result)
+        matched.append(result)
+    rest = iter(remaining)
+    return [result or next(rest, _Result(None, "", False)) for result in matched]
+
+
+def _read_calls(message: Mapping[str, Any], where: str) -> list[tuple[str | int | None, str, str]]:
+    """Return the identifier, the name and the arguments of each call of an assistant's message."""
     calls = message.get("tool_calls")
     if calls is None:
         return []
@@ -128,13 +139,15 @@ def _read_calls(message: Mapping[str, Any], where: str) -> list[tuple[str, str, 
     result = []
     for k, call in enumerate(calls):
         function = read_function(call, f"{where}: tool_calls[{k}]")
-        identifier = call.get("id")
         arguments = function.get("arguments", "")
         if not isinstance(arguments, str):
             arguments = to_json(arguments, f"{where}: the arguments of tool_calls[{k}]")
-        name = one_line(function["name"])[:MAX_TOOL_NAME]
-        result.append((name, arguments, identifier if isinstance(identifier, str | int) else None))
+        result.append((_read_identifier(call.get("id")), one_line(function["name"])[:MAX_TOOL_NAME], arguments))
     return result
+
+
+def _read_identifier(value: Any) -> str | int | None:
+    return value if isinstance(value, str | int) else None
 
 
 def read_function(value: Any, where: str) -> Mapping[str, Any]:
@@ -204,8 +217,8 @@ def message_features(turns: Sequence[Turn]) -> list[dict[str, float]]:
             if result:
                 row["repeats a result"] += result in earlier_results
                 earlier_results.add(result)
-        row["no tool"] += not turn.calls
+        row["no tool"] = not turn.calls
         length = len(turn.text) + sum(len(call.tool) + len(call.arguments) for call in turn.calls)
-        row["tokens"] += length / CHARACTERS_PER_TOKEN / TOKENS_UNIT
+        row["tokens"] = length / CHARACTERS_PER_TOKEN / TOKENS_UNIT
         rows.append({name: float(value) for name, value in row.items()})
     return rows

@@ -1,4 +1,4 @@
-"""The report of credited rollouts: a few of them as strips of turns, what features are worth, and how far to trust it."""
+"""The report of credited rollouts: a few of them as strips of turns, the effects of features, and how far to trust the credit."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ import numpy as np
 
 from lare_rl.report.figures import COLOURS, make_figure, to_svg
 from lare_rl.report.html import render_note, render_table, write_page
-from lare_rl.turns.credit import CreditedTurns
+from lare_rl.turns.credit import EFFECT_KINDS, CreditedTurns
 from lare_rl.turns.messages import Turn, split_turns
 from lare_rl.turns.rollouts import Rollout
 from lare_rl.turns.words import MESSAGES, count_decimals
@@ -45,8 +45,8 @@ def write_turn_report(
 
     Args:
         path: the file.
-        rollouts: the mappings of the rollouts' file.
-        checked: the same rollouts from `read_rollouts`.
+        rollouts: the rollouts as mappings, with their messages.
+        checked: the same from `read_rollouts`.
         credit: their credit.
 
     Raises:
@@ -76,7 +76,7 @@ def write_turn_report(
 
 
 def choose_rollouts(checked: Sequence[Rollout], credit: CreditedTurns) -> list[int]:
-    """Return rollouts to draw: alternately above and below the mean outcome, those with the clearest turns first.
+    """Return the indices of rollouts to draw: alternately above and below the mean outcome, those with the clearest turns first.
 
     The last turn does not count: its progress is the rest of the outcome, and is always large.
     """
@@ -84,11 +84,11 @@ def choose_rollouts(checked: Sequence[Rollout], credit: CreditedTurns) -> list[i
         float(np.max(np.abs(progress[:-1]) - 2 * std[:-1], initial=-np.inf))
         for progress, std in zip(credit.progress, credit.deviation, strict=True)
     ]
-    middle = np.mean([rollout.outcome for rollout in checked])
+    mean = np.mean([rollout.outcome for rollout in checked])
     order = sorted(range(len(checked)), key=lambda k: -clarity[k])
-    high = [k for k in order if checked[k].outcome > middle]
-    low = [k for k in order if checked[k].outcome <= middle]
-    mixed = [k for pair in itertools.zip_longest(high[:N_STRIPS], low[:N_STRIPS]) for k in pair if k is not None]
+    high = [k for k in order if checked[k].outcome > mean]
+    low = [k for k in order if checked[k].outcome <= mean]
+    mixed = [k for pair in itertools.zip_longest(high, low) for k in pair if k is not None]
     return mixed[:N_STRIPS]
 
 
@@ -148,10 +148,10 @@ def _format_change(number: float, std: float, decimals: int) -> str:
 
 
 def _render_effects(credit: CreditedTurns) -> str:
-    """Return the table of effects. A 0 without a deviation means that the evidence has switched the feature off."""
+    """Return the table of effects. The evidence has switched a feature off whose effects are 0 without a deviation."""
     rows, decimals = [], count_decimals(credit.trust.outcome_std)
     for effect in sorted(credit.effects, key=lambda effect: -effect.importance):
-        pairs = ((getattr(effect, x), getattr(effect, f"{x}_std")) for x in ("first", "lasting", "further"))
+        pairs = ((getattr(effect, name), getattr(effect, f"{name}_std")) for name in EFFECT_KINDS)
         numbers = (_format_change(*pair, decimals) if round(max(map(abs, pair)), decimals) else "0" for pair in pairs)
         name = effect.name if effect.unit == 1 else f"{effect.name} ({effect.unit:.3g})"
         rows.append((name, f"{effect.frequency:.0%}", *numbers))

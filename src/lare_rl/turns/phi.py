@@ -1,4 +1,4 @@
-"""A phi over turns: events of a turn that a language model, or a person, has named by a program.
+"""A phi over turns: a program, by a language model or a person, that names the events of a turn.
 
 The program is read as data by the interpreter of `lare_rl.phi` (`phi/turn_program.py`), and never executed. `design_turn_phi` checks it
 on turns (`find_problems`): it must read all of them, always give the same names, and at least one of its events must differ among them.
@@ -78,9 +78,8 @@ def read_turn_phi(source: str) -> TurnPhi:
         program = read_turn_program(source)
     except RefusedError as refusal:
         raise LareError(f"not a valid turn function: {refusal}") from None
-    if not any(
-        isinstance(node, ast.FunctionDef) and node.name == TURN_FUNCTION_NAME for node in ast.walk(program.tree)
-    ):
+    functions = (node.name for node in ast.walk(program.tree) if isinstance(node, ast.FunctionDef))
+    if TURN_FUNCTION_NAME not in functions:
         raise LareError(
             f"not a valid turn function: there is no function {TURN_FUNCTION_NAME}(tool, arguments, result, text)"
         )
@@ -91,7 +90,7 @@ def load_turn_phi(path: str | Path) -> TurnPhi:
     """Read the phi over turns in a Python file.
 
     Raises:
-        LareError: the file cannot be read, or it is no such program.
+        LareError: the file cannot be read, is not Python, or defines no `turn_events`.
     """
     path = Path(path)
     source = read_text(path)
@@ -102,7 +101,7 @@ def load_turn_phi(path: str | Path) -> TurnPhi:
 
 
 def find_problems(source: str, turns: Sequence[Turn]) -> str:
-    """Return what is wrong with a program, for its author; an empty text if it passes on these turns."""
+    """Return a message to the author of a program that does not pass on these turns, or an empty text."""
     try:
         phi = TurnPhi(read_turn_program(source))
         rows = [phi.evaluate(turn) for turn in turns]

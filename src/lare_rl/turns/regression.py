@@ -10,7 +10,7 @@ would be wrong: the length T_k depends on what the agent does later.) m has a fl
 rounds of `credit/precisions.py`.
 
 There is an intercept for each group, but their block of the posterior's precision is diagonal. So they are eliminated. With the sums
-X = sum w (x - x') and W = sum w in each group, and P the precision of (v, m) if the intercepts were known:
+X = sum w (x - x') and W = sum w in each group, and P the precision of (v, m) for known intercepts:
 
     D = beta W + alpha_0,     B = beta (X, W),     precision of (v, m) = P - B^T D^-1 B
 
@@ -26,6 +26,7 @@ from jaxtyping import Float, Int
 from lare_rl.credit.precisions import JITTER, NUMPY_BACKEND, TOLERANCE, Moments, Posterior, Regression, varies
 
 __all__ = [
+    "Elimination",
     "GroupSums",
     "PrefixFit",
     "eliminate_groups",
@@ -39,7 +40,7 @@ __all__ = [
 MAX_ROUNDS = 40
 """The maximum number of rounds of the evidence's fixed point, from each of its two starts."""
 NOISE_ONLY = 1e3
-"""The second start: each prior variance is this many times smaller than for equal shares."""
+"""In the second start, each prior variance is smaller than for equal shares by this factor."""
 
 
 class GroupSums(NamedTuple):
@@ -71,7 +72,7 @@ class PrefixFit(NamedTuple):
     group_row: Float[np.ndarray, "groups v_and_m"]
     """D^-1 B: how much the mean of b falls if an entry of (v, m) grows by 1."""
     group_precision: Float[np.ndarray, " groups"]
-    """D: the precision of b for some (v, m)."""
+    """D: the precision of b if (v, m) is known."""
     noise_variance: float
     """1 / beta, the variance of e. 1 if `is_logistic`."""
     is_logistic: bool
@@ -86,10 +87,10 @@ def sum_up(
     n_rollouts: int,
     unit: float | None = None,
 ) -> GroupSums:
-    """Return the sums over prefixes. Groups without a prefix are allowed.
+    """Return the sums over prefixes, with the outcomes y in `unit`, or else in their standard deviation.
 
-    Each prefix has the outcome y of its rollout, in `unit`, or else in its standard deviations. The degrees of freedom are the rollouts,
-    because all prefixes of a rollout have the same outcome.
+    Groups without a prefix are allowed. The degrees of freedom are those of the rollouts, because all prefixes of a rollout have the
+    same outcome.
     """
     n_groups, total = int(group.max()) + 1, weight.sum()
     x_mean, y_mean = weight @ x / total, weight @ y / total
@@ -119,11 +120,11 @@ def sum_up(
         alpha_index=alpha_index,
         equal_alpha=NUMPY_BACKEND.equal_alpha(diagonal, total, alpha_index),
     )
-    return GroupSums(x_mean, group_x, group_y, group_weight, problem)
+    return GroupSums(x_mean=x_mean, group_x=group_x, group_y=group_y, group_weight=group_weight, problem=problem)
 
 
 class Elimination(NamedTuple):
-    """The posterior of (v, m), and of b for known (v, m), in units of the standard deviation of y. m is relative to the mean of y."""
+    """The posterior of (v, m), and of b if (v, m) is known. y is in units of its standard deviation, and m relative to its mean."""
 
     root: Float[np.ndarray, "v_and_m v_and_m"]
     log_det: float
@@ -142,7 +143,7 @@ class Elimination(NamedTuple):
 
 
 def eliminate_groups(sums: GroupSums, alpha: Float[np.ndarray, " alphas"], beta: float) -> Elimination:
-    """Return the posterior of (v, m) under some precisions, with the intercepts eliminated, and then that of b."""
+    """Return the posterior under some precisions. D and B are those of the equations above."""
     problem, n = sums.problem, len(sums.x_mean)
     d = beta * sums.group_weight + alpha[-1]
     rows = beta * np.column_stack([sums.group_x, sums.group_weight])
@@ -155,7 +156,9 @@ def eliminate_groups(sums: GroupSums, alpha: Float[np.ndarray, " alphas"], beta:
     intercept = beta * sums.group_y / d - group_row @ weight
     # The flat prior of m is integrated out: that takes the precision of m itself from the determinant.
     log_det = log_det + np.log(d).sum() - np.log(beta * problem.q)
-    return Elimination(root, log_det, weight, intercept, group_row, d)
+    return Elimination(
+        root=root, log_det=log_det, weight=weight, intercept=intercept, group_row=group_row, group_precision=d
+    )
 
 
 def group_moments(sums: GroupSums, alpha: Float[np.ndarray, " alphas"], beta: float) -> Moments:
@@ -178,8 +181,8 @@ def fit_linear(
 ) -> PrefixFit:
     """Return the posterior under the precisions that maximise the evidence. The arguments are those of `sum_up`.
 
-    The evidence may have a maximum where all is noise. So there are two iterations, from equal shares and from much smaller ones. The
-    larger evidence wins.
+    The evidence may have a maximum where all variation is noise. So there are two iterations, from equal shares and from much smaller
+    ones. The result with the larger evidence is returned.
     """
     sums = sum_up(x, y, weight, group, n_rollouts)
     problem = sums.problem
@@ -209,7 +212,7 @@ def to_fit(sums: GroupSums, posterior: Elimination, beta: float, *, is_logistic:
 def fixed_point(
     sums: GroupSums, alpha: Float[np.ndarray, " alphas"], beta: float, max_rounds: int = MAX_ROUNDS
 ) -> Posterior:
-    """Iterate from some precisions until the evidence stops changing: `evidence.fixed_point`, in NumPy."""
+    """Iterate from some precisions until the evidence stops changing: `credit.evidence.fixed_point`, in NumPy."""
     next_posterior = partial(NUMPY_BACKEND.next_posterior, sums.problem, moments=partial(group_moments, sums))
     posterior = next_posterior(alpha, beta)
     for _ in range(max_rounds - 1):

@@ -9,7 +9,7 @@ A rollout is a mapping:
      "truncated": False}            # optional: whether it was cut off, so that the agent did not stop by itself
 
 Other keys are ignored. A turn is an assistant's message with the messages that answer it, up to the next assistant's message.
-If a name occurs twice, the number of `turns` replaces that of a phi, and both replace the feature of the messages.
+Where names are equal, a number of `turns` replaces that of a phi, and both replace a feature of the messages.
 """
 
 import math
@@ -31,6 +31,7 @@ MIN_NUMBER = 1e-9
 """Smaller numbers are read as 0: their squares would be too small for a fit."""
 MAX_TURNS = 10_000
 MAX_NAME = 80
+"""Characters of the name of a number."""
 
 Row = dict[str, float]
 """The numbers of a turn, by their names."""
@@ -75,32 +76,36 @@ def read_rollout(rollout: Any, where: str, phi: Phi | None = None) -> Rollout:
     truncated = rollout.get("truncated", False)
     if not isinstance(truncated, bool | np.bool_):
         raise LareError(f"{where}: truncated must be true or false, and is {short_repr(truncated)}")
-    turn_numbers, numbers = rollout.get("turns"), None
+    features = _read_features(rollout.get("messages"), rollout.get("turns"), where, phi)
+    return Rollout(tuple(features), outcome, str(group), bool(truncated))
+
+
+def _read_features(messages: Any, turn_numbers: Any, where: str, phi: Phi | None) -> list[Row]:
+    """Return the features of each turn: those of the messages, of a phi, and of `turns`."""
+    rows = None
     if turn_numbers is not None:
         check_list(turn_numbers, "turns", MAX_TURNS, where)
-        numbers = [_read_row(row, f"turns[{t}]", where) for t, row in enumerate(turn_numbers)]
-    messages = rollout.get("messages")
+        rows = [_read_row(row, f"turns[{t}]", where) for t, row in enumerate(turn_numbers)]
     if messages is None:
-        if numbers is None:
+        if rows is None:
             raise LareError(f"{where} has neither messages nor turns")
         if phi is not None:
             raise LareError(f"{where} has no messages, which a phi needs")
-        features = numbers
-    else:
-        turns = split_turns(messages, where)
-        if numbers is not None and len(numbers) != len(turns):
-            raise LareError(
-                f"{where} has {len(turns)} messages of the assistant, but numbers of {len(numbers)} turns: one entry of "
-                "turns is needed for each message of the assistant"
-            )
-        features = message_features(turns)
-        for rows in (None if phi is None else _evaluate(phi, turns, where), numbers):
-            if rows is not None:
-                features = [row | new for row, new in zip(features, rows, strict=True)]
-    if not features:
-        reason = "" if messages is None else ": the assistant says nothing"
-        raise LareError(f"{where} has no turn{reason}")
-    return Rollout(tuple(features), outcome, str(group), bool(truncated))
+        if not rows:
+            raise LareError(f"{where} has no turn")
+        return rows
+    turns = split_turns(messages, where)
+    if not turns:
+        raise LareError(f"{where} has no turn: the assistant says nothing")
+    if rows is None:
+        rows = [{}] * len(turns)
+    if len(rows) != len(turns):
+        raise LareError(
+            f"{where} has {len(turns)} messages of the assistant, but numbers of {len(rows)} turns: one entry of "
+            "turns is needed for each message of the assistant"
+        )
+    events = [{}] * len(turns) if phi is None else _evaluate(phi, turns, where)
+    return [old | event | new for old, event, new in zip(message_features(turns), events, rows, strict=True)]
 
 
 def _evaluate(phi: Phi, turns: Sequence[Turn], where: str) -> list[Row]:

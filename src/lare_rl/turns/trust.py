@@ -1,9 +1,9 @@
 """How far values of prefixes can be trusted, and the lambda that follows.
 
-Both numbers compare outcomes with values that the rollout itself had no part in:
+Two numbers compare the outcome R of each rollout with the values V of its prefixes that follow from all other rollouts:
 
-* the gain: the share of the squared error of R - (mean of the group), over all prefixes, that R - V removes. GRPO's advantage has the
-  first error. The gain has a standard error over rollouts.
+* the gain: the share of the squared error of the mean of the group, over all prefixes, that V removes. GRPO's baseline is this mean. The
+  gain has a standard error over rollouts.
 * the surprise at the end: the mean of R - V before the last turns of agents that stopped by themselves. If it is large, then the values
   miss what agents see before they stop, and the last turn gets the credit of the turns before it. If it is negative, the last turn
   gets less than its due, which has done no harm on the testbeds.
@@ -48,21 +48,24 @@ MIN_ROLLOUTS = 16
 
 
 class Errors(NamedTuple):
-    """Squared errors of the rollouts of a call, summed over their prefixes."""
+    """The errors of the rollouts of a call."""
 
     reduction: Float[np.ndarray, " rollouts"]
-    """How much smaller the error of V is than that of the mean of the group."""
+    """`baseline` minus the squared error of V, summed over the prefixes of a rollout."""
     baseline: Float[np.ndarray, " rollouts"]
+    """The squared error of the mean of the group, summed over the prefixes of a rollout."""
     surprise: Float[np.ndarray, " stopped"]
     """R - V before the last turn, of the rollouts that were not cut off."""
     outcome: Float[np.ndarray, " rollouts"]
 
 
 class Trust(NamedTuple):
-    """How far values can be trusted. NaN if it is not known."""
+    """How far values can be trusted."""
 
     gain: float
+    """NaN if there are fewer than `MIN_ROLLOUTS` rollouts, or if all errors are 0."""
     gain_error: float
+    """The standard error of the gain."""
     surprise: float
     """In the unit of outcomes."""
     outcome_std: float
@@ -72,7 +75,7 @@ class Trust(NamedTuple):
 def group_means(table: TurnTable) -> Float[np.ndarray, " rollouts"]:
     """Return the mean outcome of each rollout's group without the rollout itself, shrunk to the mean of all rollouts.
 
-    The evidence sets how far it is shrunk: the values are compared with the best baseline that knows the group only.
+    The evidence sets how far it is shrunk, so that the values are compared with the best baseline that depends only on the group.
     """
     n, group, outcome = len(table.length), table.group, table.outcome
     fit = fit_linear(np.zeros((n, 0)), outcome, np.ones(n), group, n)
@@ -82,25 +85,30 @@ def group_means(table: TurnTable) -> Float[np.ndarray, " rollouts"]:
 
 
 def measure_errors(table: TurnTable, held_out: Float[np.ndarray, " turns"]) -> Errors:
-    """Return the errors of values that no rollout had a part in itself."""
+    """Return the errors of held-out values: those of a rollout's prefixes follow from all other rollouts."""
     index = table.rollout_index
     baseline = table.length * (table.outcome - group_means(table)) ** 2
     error = np.bincount(index, (table.outcome[index] - held_out) ** 2)
     surprise = (table.outcome - held_out[table.last])[~table.truncated]
-    return Errors(baseline - error, baseline, surprise, table.outcome)
+    return Errors(reduction=baseline - error, baseline=baseline, surprise=surprise, outcome=table.outcome)
 
 
 def summarise(errors: Sequence[Errors]) -> Trust:
     """Return the trust in values from the errors of the latest calls."""
-    reduction, baseline, surprise, outcome = (np.concatenate(values) for values in zip(*errors, strict=True))
-    is_measured = len(baseline) >= MIN_ROLLOUTS and baseline.sum() > 0
-    gain, gain_error = ratio_of_sums(reduction, baseline) if is_measured else (math.nan, math.nan)
-    surprise = float(surprise.mean()) if len(surprise) else 0.0
-    return Trust(gain, gain_error, surprise, outcome_std=float(outcome.std()), n_rollouts=len(baseline))
+    calls = Errors(*(np.concatenate(arrays) for arrays in zip(*errors, strict=True)))
+    is_measured = len(calls.baseline) >= MIN_ROLLOUTS and calls.baseline.sum() > 0
+    gain, gain_error = ratio_of_sums(calls.reduction, calls.baseline) if is_measured else (math.nan, math.nan)
+    return Trust(
+        gain=gain,
+        gain_error=gain_error,
+        surprise=float(calls.surprise.mean()) if len(calls.surprise) else 0.0,
+        outcome_std=float(calls.outcome.std()),
+        n_rollouts=len(calls.outcome),
+    )
 
 
 def choose_lambda(trust: Trust) -> tuple[float, Finding]:
-    """Return lambda, and why."""
+    """Return lambda, and the reason for it."""
     values = trust._asdict() | {"decimals": max(0, count_decimals(trust.outcome_std) - 1)}
     if math.isnan(trust.gain):
         return GRPO, Finding("unknown", values)

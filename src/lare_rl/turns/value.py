@@ -32,30 +32,34 @@ def fit_prefixes(table: TurnTable, x: Float[np.ndarray, "turns features"], *, is
 
 
 class _Predictions(NamedTuple):
-    """For each prefix: log odds or values, values, and the first two derivatives of the log likelihood."""
+    """Predictions for each prefix, and the derivatives of the log likelihood of its outcome."""
 
     eta: Float[np.ndarray, " turns"]
+    """The value or, if the fit is logistic, its log odds."""
     value: Float[np.ndarray, " turns"]
     slope: Float[np.ndarray, " turns"]
-    """Of the value with respect to eta."""
+    """The derivative of the value with respect to eta."""
     gradient: Float[np.ndarray, " turns"]
+    """The derivative of the log likelihood with respect to eta."""
     curvature: Float[np.ndarray, " turns"]
+    """Its second derivative, with the opposite sign."""
 
 
 def _predict(table: TurnTable, x: Float[np.ndarray, "turns features"], fit: PrefixFit) -> _Predictions:
-    """Return predictions with the intercepts of all rollouts."""
+    """Return predictions with the intercept of each rollout's group."""
     index = table.rollout_index
     eta = fit.mean + (x - fit.x_mean) @ fit.weight + fit.intercept[table.group][index]
     value = logistic(eta) if fit.is_logistic else eta
     slope = value * (1 - value) if fit.is_logistic else np.ones_like(eta)
     weight = len(table.length) / len(x) / fit.noise_variance
-    return _Predictions(eta, value, slope, weight * (table.outcome[index] - value), weight * slope)
+    gradient = weight * (table.outcome[index] - value)
+    return _Predictions(eta=eta, value=value, slope=slope, gradient=gradient, curvature=weight * slope)
 
 
 def values(table: TurnTable, x: Float[np.ndarray, "turns features"], fit: PrefixFit) -> Float[np.ndarray, " turns"]:
     """Return V of the prefix before each turn. The intercept of a rollout's group leaves out the rollout itself."""
     predictions, index = _predict(table, x, fit), table.rollout_index
-    gradient, curvature = (np.bincount(index, values) for values in (predictions.gradient, predictions.curvature))
+    gradient, curvature = (np.bincount(index, terms) for terms in (predictions.gradient, predictions.curvature))
     change = gradient / np.maximum(fit.group_precision[table.group] - curvature, 1e-12)
     eta = predictions.eta - change[index]
     return logistic(eta) if fit.is_logistic else eta
@@ -71,8 +75,7 @@ def changes(table: TurnTable, value: Float[np.ndarray, " turns"]) -> Float[np.nd
 def advantages(table: TurnTable, change: Float[np.ndarray, " turns"], lambda_: float) -> Float[np.ndarray, " turns"]:
     """Return A_t = sum_l lambda^l delta_(t+l) within each rollout."""
     advantage = np.copy(change)
-    t = np.arange(len(change)) - np.repeat(table.first, table.length)
-    turns_left = np.repeat(table.length, table.length) - 1 - t
+    turns_left = np.repeat(table.last, table.length) - np.arange(len(change))
     rows = np.argsort(turns_left, kind="stable")
     ends = np.cumsum(np.bincount(turns_left))
     for start, stop in itertools.pairwise(ends):  # all rollouts at once, from their ends
@@ -93,7 +96,7 @@ def posterior_stds(
 
 
 def _rows(table: TurnTable, x: Float[np.ndarray, "turns features"], fit: PrefixFit) -> Float[np.ndarray, "turns n"]:
-    """Return how eta depends on (v, m), of which b is a function."""
+    """Return the derivative of eta with respect to (v, m), of which b is a function."""
     return np.column_stack([x - fit.x_mean, np.ones(len(x))]) - fit.group_row[table.group][table.rollout_index]
 
 
@@ -113,7 +116,7 @@ def held_out_values(
         index = table.first[rollouts][:, None] + np.arange(size)
         block = rows[index]
         covariance = block @ block.swapaxes(1, 2) + 1 / fit.group_precision[table.group[rollouts]][:, None, None]
-        # The only rollout of all determines m alone: without this, the system would be singular.
+        # A single rollout determines m alone: without this, the system would be singular.
         system = (1 + 1e-9) * np.eye(size) - covariance * predictions.curvature[index][:, None, :]
         change = np.linalg.solve(system, covariance @ predictions.gradient[index][..., None])
         eta[index] = predictions.eta[index] - change[..., 0]

@@ -37,5 +37,5 @@ MESSAGES = {
 
 
 def count_decimals(outcome_std: float) -> int:
-    """Return the decimal places of changes of the value: three if outcomes are 0 and 1, and fewer if they are larger."""
+    """Return the decimal places to write changes of the value with: three if outcomes are 0 and 1, and fewer if they are larger."""
     return max(0, 2 - math.floor(math.log10(outcome_std))) if outcome_std > 0 else 3
