@@ -45,6 +45,7 @@ phi = verify_function(PHI, task)
 tiny = dict(method="dense", steps=60, rollout_steps=12, evaluate_every=60, evaluation_episodes=1, seeds=2, capacity=64)
 run = lare_rl.train(task, lare_rl.Settings(algorithm="quiet", quiet={"shift": 0.25}, **tiny), out="run", listeners=[])
 policy = lare_rl.load_policy("run")
+sizes = dict(action_size=1, n_envs=2, n_steps=4, max_steps=4)
 credit = lare_rl.CreditAssigner("ircr", observation_space=3, action_space=1)
 steps = credit.add_episode(np.ones((5, 3)), np.ones((5, 1)), np.ones((5, 3)), reward=1.0)
 def command(*arguments):
@@ -98,6 +99,11 @@ CALLS = {
     "lare_rl.design(7)": "TaskSpec",
     "lare_rl.design(task, model='gpt')": "reply(messages, number)",
     "lare_rl.reflect(phi, 7, None)": "TaskSpec",
+    "lare_rl.reflect(phi, task, lambda messages, number: '', 1.5)": "rounds = 1.5",
+    "lare_rl.pure_credit('bayes', observation_size='2', **sizes)": "observation_size = '2'",
+    "lare_rl.pure_credit('bayes', observation_size=2, scored_observation='now', **sizes)": "'before', 'after' or 'both'",
+    "lare_rl.pure_credit('bayes', observation_size=2, settings={'score': 'sum'}, **sizes)": "lare_rl.CreditSettings",
+    "lare_rl.pure_credit('lare-bayes', 'phi.py', observation_size=2, **sizes)": "lare_rl.load_function",
     "phi([[0, 0]] * 5, [[0]] * 4)": "differ: 5 and 4",
     "phi([0, 0, 0], [0])": "(batch, 2)",
     "phi([[0, 0]], 'left')": "'left'",

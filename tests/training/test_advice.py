@@ -24,7 +24,7 @@ from lare_rl.training.advice import (
     find_untrained,
     find_unwritten_texts,
 )
-from lare_rl.training.evaluation import greedy_actions, saturation
+from lare_rl.training.evaluation import N_STATES, greedy_actions, saturation
 from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_learner
 from lare_rl.util.findings import render
@@ -108,12 +108,12 @@ def test_saturated_policies(action, saturations, start):
 def test_greedy_actions_of_newest_states(dense_run):
     config, learner, host, _ = load_learner(dense_run)
     replay, actor = learner.replay, get_actor(learner.algorithm, host["step"], config)
-    actions = greedy_actions(actor, replay, config, 5)
-    assert actions.shape == (2, 5, 1)
+    actions = greedy_actions(actor, replay, config)
+    assert actions.shape == (2, N_STATES, 1)
     rows = (int(replay.next_row[1, 0]) - np.arange(1, 6)) % 64
     observation = np.asarray(replay.columns["observation"][1, 0, rows, 0])
     policy = lare_rl.load_policy(dense_run, seed=dense_run.seeds[1])
-    np.testing.assert_allclose(2 * actions[1], policy(observation), rtol=1e-5)
+    np.testing.assert_allclose(2 * actions[1, :5], policy(observation), rtol=1e-5)
 
 
 @pytest.mark.parametrize(

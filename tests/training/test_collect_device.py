@@ -25,7 +25,7 @@ SEEDS, ENVS, TIME = (0, 3), 4, 9
 
 
 class KeyedEcho(Echo):
-    """Its state holds a random key. Its measure is not a number after the end of an episode."""
+    """Its state holds a random key. Its reward and its measure are not numbers after the end of an episode."""
 
     def reset(self, key):
         state, timestep = super().reset(key)
@@ -36,8 +36,8 @@ class KeyedEcho(Echo):
         return (echo, jax.random.split(state[1])[0]), timestep
 
     def timestep(self, cues, reward):
-        measure = jnp.where(cues.step > cues.length, jnp.nan, reward.sum())
-        return super().timestep(cues, reward)._replace(measures={"right": measure})
+        reward = jnp.where(cues.step > cues.length, jnp.nan, reward)
+        return super().timestep(cues, reward)
 
 
 ENV = KeyedEcho()
@@ -209,6 +209,10 @@ def test_states_with_random_keys_are_restored(learner):
         np.testing.assert_array_equal(collectors[1].state_dict()[name], array)
     actions = [collector.collect(learner[1], ENVS * TIME).action for collector in collectors]
     np.testing.assert_array_equal(*actions)
+    with pytest.raises(ValueError, match=r"array 0 .*\(2, 5\), not .*\(2, 4\)"):
+        collectors[1].restore(
+            {name: np.repeat(array, [1, 1, 1, 2], 1) for name, array in collectors[0].state_dict().items()}
+        )
 
 
 CHANGES = {

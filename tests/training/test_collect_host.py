@@ -20,9 +20,10 @@ from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.training import collect_host
 from lare_rl.training.collect_host import HostCollector
 from lare_rl.training.compiled import compile_functions, init_seeds
+from lare_rl.training.divergence import DivergedError
 from lare_rl.training.policy import get_actor
 from lare_rl.training.streams import Stream, episode_seed, seed_keys, stream_keys
-from lare_rl.training.unroll_host import DivergedError, evaluate_on_host, evaluate_policy_on_host, record_on_host
+from lare_rl.training.unroll_host import evaluate_on_host, evaluate_policy_on_host, record_on_host
 
 
 class Wrapped(gymnasium.Wrapper):

@@ -13,6 +13,7 @@ from lare_rl.config.settings import Settings
 from lare_rl.errors import LareError
 from lare_rl.runs.config_file import make_config
 from lare_rl.runs.directory import Run
+from lare_rl.training import advice
 from lare_rl.training import session as sessions
 from lare_rl.training import train as training
 from lare_rl.training.decoder_fits import FirstFitStoppedError
@@ -70,6 +71,14 @@ def test_time_of_an_evaluation_has_no_checkpoint_in_it(seconds, is_slow, tmp_pat
     monkeypatch.setattr(time, "monotonic", lambda: session.clock)
     training.run_session(session, [listener], threading.Event())
     assert any("--evaluation-episodes" in message for message in listener.messages) == is_slow
+
+
+def test_return_that_is_not_a_number_is_no_constant_return(tmp_path, monkeypatch):
+    monkeypatch.setattr(advice, "N_EQUAL_EVALUATIONS", 2)
+    listener, session = Recorder(), EmptySession(tmp_path)
+    session.evaluate = lambda rate: [{"step": session.step, "seed": 0, "evaluation/return": None, "critic/loss": 1.0}]
+    training.run_session(session, [listener], threading.Event())
+    assert not any("same return" in message for message in listener.messages)
 
 
 def test_first_fit_that_is_stopped_is_not_kept(tmp_path):

@@ -40,6 +40,15 @@ def test_line_per_evaluation(evaluation, line):
     assert not any("left" in other for other in between)  # that rate includes compiling
 
 
+def test_rates_of_another_run_include_its_compiling():
+    text = io.StringIO()
+    terminal, updated = Terminal(Console(file=text)), metrics(2500, 5.0, **{"critic/loss": 1.0})
+    for _ in range(2):
+        terminal.on_start("Task method", 0, 20_000)
+        terminal.on_evaluation(updated)
+    assert text.getvalue().count("5 steps/s with compiling") == 2
+
+
 def record_lines(monkeypatch, seconds):
     """Return a terminal and its text. The clock moves on by some seconds whenever it is read."""
     text, clock = io.StringIO(), itertools.count(0, seconds)

@@ -117,8 +117,19 @@ def test_functions_are_mapped_over_seeds():
         ({"method": "bayes", "settings": CreditSettings(exact="last")}, "exact"),
         ({"method": "rrd", "settings": CreditSettings(steps=16)}, "sampled_steps"),
         ({"method": "nothing"}, "nothing"),
+        ({"n_envs": 0}, "n_envs = 0"),
+        ({"low": [0.0, 0.0]}, r"low = \[0.0, 0.0\].*\(1,\)"),
+        ({"high": "wide"}, "high = 'wide'"),
     ],
 )
 def test_pure_credit_refuses(arguments, words):
     with pytest.raises(LareError, match=words):
-        lare_rl.pure_credit(**arguments, **SIZES)
+        lare_rl.pure_credit(**({"method": "bayes"} | SIZES | arguments))
+
+
+@pytest.mark.parametrize("name", ["observation", "action", "next_observation", "reward"])
+def test_steps_of_other_sizes_are_refused(name):
+    credit, (steps, _) = pure_credit("bayes", **SUM), make_steps(jax.random.key(0))
+    values = jnp.stack(2 * [getattr(steps, name)], axis=-1)
+    with pytest.raises(LareError, match=rf"{name} has the shape \(20, 4,"):
+        credit.reward(credit.init(jax.random.key(0)), steps._replace(**{name: values}))

@@ -55,7 +55,7 @@ def test_update_keeps_the_metrics_of_seeds_without_updates():
         ([0, 1], [np.nan, 5], {"algorithm/updates": [2, 1], "loss": [3, 5]}),
         ([0, 0], [np.nan, np.nan], {"algorithm/updates": [2, 1], "loss": [3, 5]}),
     ]:
-        metrics.append({"algorithm/updates": jnp.array(updates), "loss": jnp.array(losses)})
+        metrics.append({"algorithm/updates": jnp.array(updates, float), "loss": jnp.array(losses)})
         training._update(random_steps())
         np.testing.assert_equal(
             {name: list(map(float, values)) for name, values in training.latest_metrics.items()}, latest

@@ -37,6 +37,10 @@ def test_mlflow_gets_every_number(dense_run, tmp_path, monkeypatch):
         for key in tracked.data.metrics:
             history = {point.step: point.value for point in listener.client.get_metric_history(run_id, key)}
             assert history == {step: line[key] for step, line in expected.items() if key in line}
+    first_runs = listener.runs
+    listener.on_start("Chase dense", 0, 240)
+    listener.on_evaluation(dense_run.metrics()[-2:])
+    assert set(first_runs.values()).isdisjoint(listener.runs.values())  # another training has other runs
 
 
 @pytest.mark.long
@@ -57,9 +61,11 @@ def test_wandb_gets_every_number(dense_run, tmp_path, monkeypatch):
     assert len(list(tmp_path.glob("wandb/offline-run-*/*.wandb"))) == 2
 
 
-def test_missing_library_and_unusable_server(monkeypatch):
+def test_missing_library_and_unusable_arguments(monkeypatch):
     with pytest.raises(LareError, match=r"MLflow cannot be used: .*nowhere"):
         MLflow(tracking_uri="nowhere://")
+    with pytest.raises(LareError, match=r"wandb.init .*'projekt'"):
+        WeightsAndBiases(projekt="toys")
     for listener, library in ((WeightsAndBiases, "wandb"), (MLflow, "mlflow")):
         monkeypatch.setitem(sys.modules, library, None)
         with pytest.raises(LareError, match=rf"needs an extra: .*\[{library}\]"):

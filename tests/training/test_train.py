@@ -26,10 +26,10 @@ from lare_rl.runs.directory import open_run
 from lare_rl.runs.metric_names import ACTOR_SATURATION
 from lare_rl.training import train as training
 from lare_rl.training.collect_host import HostCollector
+from lare_rl.training.divergence import DivergedError
 from lare_rl.training.latent_functions import choose_functions
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.session import Session
-from lare_rl.training.unroll_host import DivergedError
 from lare_rl.util.provenance import code_version
 
 

@@ -33,15 +33,15 @@ __all__ = [
 MAX_RMS = 10.0
 """The largest root mean square of an observation's feature that needs no advice."""
 N_PROBE_STATES = 1000
-"""The number of stored observations of an environment that are inspected."""
+"""The most stored observations of an environment that are inspected."""
 N_EQUAL_EVALUATIONS = 5
-"""The number of evaluations with equal returns that is reported."""
+"""So many evaluations in a row with equal returns are reported."""
 MIN_EQUAL_EPISODES = 10
-"""A run with fewer evaluated episodes is not reported for equal returns."""
+"""Equal returns of all episodes are reported of a run with at least so many evaluated episodes."""
 EQUAL_RTOL = 1e-3
 """Returns are equal if they differ by less than this fraction of their size."""
 MAX_EVALUATION_SHARE, MIN_EVALUATION_S = 0.3, 5.0
-"""The share of the time, and the time (s), of an evaluation that need no advice."""
+"""An evaluation is slow if it takes a larger share of the time, and more seconds."""
 
 MESSAGES = {
     "all steps random": "{reason}",
@@ -97,19 +97,19 @@ def describe_untrained(run: Run) -> str | None:
 
 
 def find_unwritten_texts(task: TaskSpec) -> list[Finding]:
-    """Find texts of a draft that were never written. The time limit may then be the draft's guess, too."""
+    """Find texts of a draft that the user has not written. The time limit may then be the draft's guess, too."""
     keys = tuple(dict.fromkeys(key for role in task.roles for key in unwritten_texts(role)))
     limit = Finding("guessed limit", {"limit": DEFAULT_LIMIT}) if task.max_episode_steps == DEFAULT_LIMIT else None
     return [Finding("unwritten texts", {"placeholder": FILL_IN, "keys": keys, "limit": limit})] if keys else []
 
 
 def find_large_observations(run: Run, replay: Replay, config: TrainConfig) -> list[Finding]:
-    """Find a feature of the observations that is large, if the algorithm does not normalise observations.
+    """Find the largest feature of the observations, if it is too large for an algorithm that does not normalise observations.
 
     A large feature may drive a policy that ends in a tanh to a bound of the actions before its first update. Its gradient is
     then 0.
     """
-    settings, hyperparameters = run.config.settings, run.config.settings.hyperparameters
+    algorithm, hyperparameters = run.config.settings.algorithm, run.config.settings.hyperparameters
     can_normalise = isinstance(hyperparameters, PPOSettings)
     if (can_normalise and hyperparameters.normalise_observations) or "observation" not in replay.columns:
         return []
@@ -121,11 +121,11 @@ def find_large_observations(run: Run, replay: Replay, config: TrainConfig) -> li
         return []
     alternative = Finding("use ppo") if config.env.n_agents == 1 else None
     if can_normalise:
-        alternative = Finding("normalise", {"algorithm": settings.algorithm})
+        alternative = Finding("normalise", {"algorithm": algorithm})
     sizes = {"observation": config.env.observation_size}
-    names = raw_feature_names(run.config.task.roles[0].observation, "", sizes)
-    values = {"feature": names[largest], "rms": float(rms[largest])}
-    return [Finding("large observations", values | {"algorithm": settings.algorithm, "alternative": alternative})]
+    feature = raw_feature_names(run.config.task.roles[0].observation, "", sizes)[largest]
+    values = {"feature": feature, "rms": float(rms[largest]), "algorithm": algorithm, "alternative": alternative}
+    return [Finding("large observations", values)]
 
 
 def find_saturated_policies(saturations: Sequence[float], seeds: Sequence[int]) -> list[Finding]:
@@ -139,7 +139,7 @@ def find_saturated_policies(saturations: Sequence[float], seeds: Sequence[int]) 
 
 
 def find_constant_returns(returns: Sequence[Float[np.ndarray, " seeds"]]) -> list[Finding]:
-    """Find out whether the last evaluations of every seed have the same return. It is reported once.
+    """Find out whether the last evaluations of every seed have equal returns, and did not have them one evaluation before.
 
     `returns` has all evaluations since the policy was first updated.
     """
@@ -149,7 +149,7 @@ def find_constant_returns(returns: Sequence[Float[np.ndarray, " seeds"]]) -> lis
 
 
 def find_slow_evaluations(settings: ResolvedSettings, evaluation_s: float, interval_s: float) -> list[Finding]:
-    """Find out whether an evaluation takes much of the time. `interval_s` is the time from the end of one to the end of the next."""
+    """Find out whether an evaluation takes much of the time. `interval_s` is the time between the ends of two evaluations."""
     share = evaluation_s / interval_s
     if share <= MAX_EVALUATION_SHARE or evaluation_s <= MIN_EVALUATION_S:
         return []

@@ -27,8 +27,8 @@ from lare_rl.training.streams import Stream, device_noise, stream_keys
 __all__ = ["DeviceCollector", "VecEnvState", "collect", "is_reset_cheap", "make_jax_env", "reset", "unroll_on_device"]
 
 MAX_RESET_FLOPS = 2e7
-"""An accelerator resets all environments with each step. It uses the result where an episode has ended, if that takes fewer operations than
-this. The host would need longer to ask whether one has ended."""
+"""If a reset of all environments takes fewer operations, an accelerator makes it with each step, and uses the result where an episode has
+ended. It would take longer to ask first whether an episode has ended."""
 
 
 class VecEnvState(NamedTuple):
@@ -72,12 +72,19 @@ class DeviceCollector:
         return {str(i): np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf) for i, leaf in leaves}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
-        """Restore the environments. Return which episodes were dropped, and messages, as on the host: here there are none."""
+        """Restore the environments. Return which episodes were dropped, and messages, as on the host: here there are none.
+
+        Raises `ValueError` or `KeyError` if the arrays are not those of these environments.
+        """
         leaves, structure = jax.tree.flatten(self.envs)
         saved: list[Any] = [arrays[str(i)] for i in range(len(leaves))]
         for i, leaf in enumerate(leaves):
             if _is_key(leaf):
                 saved[i] = jax.random.wrap_key_data(saved[i], impl=jax.random.key_impl(leaf))
+            if (saved[i].shape, saved[i].dtype) != (leaf.shape, leaf.dtype):
+                raise ValueError(
+                    f"array {i} of the environments is {saved[i].dtype}{saved[i].shape}, not {leaf.dtype}{leaf.shape}"
+                )
         self.envs = jax.device_put(jax.tree.unflatten(structure, saved), seed_sharding(self._n_devices))
         return np.zeros(self.envs.episode_start.shape, bool), []
 
@@ -101,9 +108,7 @@ def unroll_on_device(
     reset_keys, step_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
     envs = reset(env, reset_keys, n_episodes, config)
 
-    def body(
-        carry: tuple[VecEnvState, Bool[Array, "seeds episodes"]], randomness: tuple[Any, Any]
-    ) -> tuple[tuple[VecEnvState, Bool[Array, "seeds episodes"]], EpisodeBatch]:
+    def body(carry: tuple[VecEnvState, Array], randomness: tuple[Any, Any]) -> tuple[Any, EpisodeBatch]:
         envs, running = carry
         envs, steps = _step(env, envs, actor, *randomness, config, act)
         return (envs, running & ~steps.ended), EpisodeBatch(steps, running, envs.state)
@@ -124,7 +129,8 @@ def _jit_functions(env: JaxEnv, config: TrainConfig) -> tuple[Callable[..., Any]
 
 
 def reset(env: JaxEnv, keys: Key[Array, " seeds"], n_envs: int, config: TrainConfig) -> VecEnvState:
-    state, timestep = _map_envs(env.reset)(_split_keys(keys, n_envs))
+    """Begin an episode in `n_envs` environments of each seed."""
+    state, timestep = jax.vmap(jax.vmap(env.reset))(_split_keys(keys, n_envs))
     episode_start = jnp.ones((len(keys), n_envs), bool)
     return VecEnvState(state, timestep, init_memory(config, *episode_start.shape), episode_start)
 
@@ -132,9 +138,9 @@ def reset(env: JaxEnv, keys: Key[Array, " seeds"], n_envs: int, config: TrainCon
 def _draw(
     keys: Key[Array, "time seeds"], n_envs: int, config: TrainConfig, deterministic: bool
 ) -> tuple[Float[Array, "time seeds envs agents noise"] | None, Key[Array, "time seeds envs"]]:
-    """Draw the noise of the policy (None without noise), and the keys of the environments.
+    """Draw the noise of the policy (None if it is deterministic), and the keys of the environments, for all steps.
 
-    Those of many steps are drawn at once, which takes an accelerator as long as those of one step.
+    An accelerator needs as long for a single step.
     """
 
     def draw_step(keys: Key[Array, " seeds"]) -> tuple[Any, Any]:
@@ -153,7 +159,7 @@ def _step(
     timestep = envs.timestep
     action, memory = act(actor, envs.memory, timestep.observation, timestep.available, noise, envs.episode_start)
     env_action = action if config.env.discrete else to_env_action(action, config.env)
-    state, next_timestep = _map_envs(env.step)(envs.state, env_action, keys)
+    state, next_timestep = jax.vmap(jax.vmap(env.step))(envs.state, env_action, keys)
     steps = Trajectory(timestep=timestep, action=action, env_action=env_action, next_timestep=next_timestep)
     return VecEnvState(state, next_timestep, memory, jnp.zeros_like(envs.episode_start)), steps
 
@@ -183,10 +189,10 @@ def collect(
 
         if config.resets_with_steps:
             return reset_ended(envs), steps
-        return jax.lax.cond(jnp.any(steps.ended), reset_ended, lambda envs: envs, envs), steps
+        return jax.lax.cond(jnp.any(steps.ended), reset_ended, lambda unchanged: unchanged, envs), steps
 
     keys = jnp.swapaxes(_split_keys(keys, config.rollout_steps), 0, 1)
-    step_keys, reset_keys = jnp.unstack(jax.vmap(partial(_split_keys, n_envs=2))(keys), axis=2)
+    step_keys, reset_keys = jnp.unstack(jax.vmap(partial(_split_keys, number=2))(keys), axis=2)
     randomness = (*_draw(step_keys, n_envs, config, deterministic=False), reset_keys)
     envs, steps = jax.lax.scan(body, envs, randomness)
     return envs, jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), steps)
@@ -221,7 +227,7 @@ def make_jax_env(task: TaskSpec) -> JaxEnv:
 
 
 def is_reset_cheap(env: JaxEnv, n_envs: int) -> bool:
-    """Whether an accelerator should reset all environments with each step, by XLA's estimate of the operations."""
+    """Return whether an accelerator should reset all environments with each step, by XLA's estimate of the operations."""
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), n_envs))
     cost = jax.jit(jax.vmap(env.reset)).lower(keys).cost_analysis()
     return float((cost or {}).get("flops", math.inf)) < MAX_RESET_FLOPS
@@ -232,7 +238,7 @@ def _evaluate(
 ) -> tuple[Evaluation, Bool[Array, "seeds episodes"]]:
     """Return the results of whole episodes, and whether each has ended."""
     steps, mask, _ = unroll_on_device(env, actor, keys, n_episodes, config, config.deterministic_evaluation)
-    reward = steps.next_timestep.reward * mask[..., None]
+    reward = jnp.where(mask[..., None], steps.next_timestep.reward, 0)  # after the end, an environment may return NaN
     returns = [team_mean(reward, steps.timestep.alive, team).sum(axis=0) for team in config.env.teams]
     summed_returns = [reward[..., team.agents].sum(axis=(0, -1)) for team in config.env.teams]
     last = mask & steps.ended
@@ -241,11 +247,5 @@ def _evaluate(
     return Evaluation(returns, summed_returns, mask.sum(axis=0), measures), last.any(axis=0)
 
 
-def _map_envs(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Map a function over seeds and environments."""
-    return jax.vmap(jax.vmap(function))
-
-
-def _split_keys(keys: Key[Array, " seeds"], n_envs: int) -> Key[Array, "seeds {n_envs}"]:
-    """Return keys for the environments of each seed."""
-    return jax.vmap(lambda key: jax.random.split(key, n_envs))(keys)
+def _split_keys(keys: Key[Array, " seeds"], number: int) -> Key[Array, "seeds {number}"]:
+    return jax.vmap(lambda key: jax.random.split(key, number))(keys)

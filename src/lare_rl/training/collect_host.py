@@ -2,8 +2,8 @@
 
 The policy acts on the CPU. Once for each iteration, its weights are copied there, noise is drawn, and actions are checked.
 
-An episode is determined by its seed and its actions. So a run can be resumed in the middle of an episode, in any
-simulator: reset with the seed, play the actions, and compare the observation bit for bit.
+An episode is determined by its seed and its actions. To resume a run in the middle of an episode, in any simulator, its environment is
+reset with the seed, and the actions are repeated. The observation must then be the same, bit for bit.
 """
 
 import contextlib
@@ -22,20 +22,21 @@ from lare_rl.envs.interface import Timestep, to_env_action
 from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.vec_env import VecEnv
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.training.divergence import check_actions
 from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.policy import draw_noise, init_host_memory, make_host_policy
 from lare_rl.training.streams import Stream, episode_seed, numpy_generator
-from lare_rl.training.unroll_host import add_seed_axis, check_actions, evaluate_policy_on_host
+from lare_rl.training.unroll_host import add_seed_axis, evaluate_policy_on_host
 
 __all__ = ["HostCollector", "make_host_collector"]
 
 
 class HostCollector:
-    """The training environments of a run, with the running episode of each, and the environments of its evaluations.
+    """The training environments of a run, with the running episode of each, and its evaluation environments.
 
     Args:
         envs: `n_envs` environments of the first seed, then of the second, and so on.
-        evaluation_envs: the same for evaluations, in any number for each seed.
+        evaluation_envs: environments for evaluations in the same order, equally many for each seed.
         seeds: the seeds of the run.
     """
 
@@ -46,7 +47,8 @@ class HostCollector:
         self._action_shape = envs.spec.n_agents, envs.spec.action_size
         self._memory = init_host_memory(config, *self.shape)
         """The memory of the actors."""
-        self._step, self._on_step = 0, _ignore_step
+        self._step = 0
+        self._on_step: Callable[[int], None] = lambda step: None
         self._episode = np.full(len(seeds) * config.n_envs, -1)
         """The number of each environment's running episode, among the episodes of this environment."""
         self._actions: list[list[np.ndarray]] = [[] for _ in self._episode]
@@ -57,9 +59,9 @@ class HostCollector:
         self._reset(np.ones(len(self._episode), bool))
 
     def watch(self, on_step: Callable[[int], None], stop_requested: Callable[[], bool]) -> None:
-        """Call `on_step` with the number of steps of each seed while environments step, also during evaluations.
+        """Call `on_step` with the number of steps of each seed whenever environments have stepped, also in evaluations.
 
-        `stop_requested` says whether the user wants to stop. Environments in other processes must then reply soon.
+        `stop_requested` returns whether the user wants to stop. Environments in other processes must then reply soon.
         """
         self._on_step = on_step
         self._envs.stop_requested = self._evaluation_envs.stop_requested = stop_requested
@@ -70,8 +72,7 @@ class HostCollector:
         self._step = step
         if step < config.warmup:
             shape = config.rollout_steps, config.n_envs, *self._action_shape
-            uniform = [rng.uniform(-1, 1, shape) for rng in rngs]
-            action = np.stack(uniform, axis=1).astype(np.float32)
+            action = np.stack([rng.uniform(-1, 1, shape) for rng in rngs], axis=1).astype(np.float32)
             return self.collect_by(lambda timestep, action_t, episode_start: action_t, action)
         policy = make_host_policy(config, actor, config.n_envs, deterministic=False)
         noise = np.moveaxis(draw_noise(config, rngs, config.rollout_steps, config.n_envs), 1, 0)
@@ -147,8 +148,7 @@ class HostCollector:
     def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
         """Restore the running episodes, by their seeds and actions.
 
-        If that does not lead to the same observation, bit for bit, the environment is not deterministic. The episode is
-        dropped, and a new one begins.
+        If an observation differs in one bit, the environment is not deterministic: the episode is dropped, and a new one begins.
 
         Returns:
             Which episodes were dropped, and a message about each of them.
@@ -194,7 +194,6 @@ class HostCollector:
         return self._seeds[index // self._n_envs]
 
     def _episode_name(self, index: int) -> str:
-        """Return the name of an environment's running episode, for messages."""
         env = f" in environment {index % self._n_envs}" if self._n_envs > 1 else ""
         return f"episode {self._episode[index]} of seed {self._seed(index)}{env}"
 
@@ -216,9 +215,6 @@ class HostCollector:
                 raise
             where = f"at step {len(self._actions[index])} of {self._episode_name(index)}"
             raise EnvOutputError(f"{error}, {where}") from None
-
-
-def _ignore_step(step: int) -> None: ...
 
 
 def make_host_collector(

@@ -2,7 +2,7 @@
 
 If environments step on the host, each function is a program of its own (`Session.advance` calls them in order). In an environment of
 pure functions, collection, factors, replay, fits, relabelling and updates of many iterations are one program (`compile_loop`), so
-nothing is transferred between two iterations. Both make Algorithm 1 of the LaRe paper.
+nothing is transferred between two iterations. Both are Algorithm 1 of the LaRe paper.
 """
 
 import contextlib
@@ -45,20 +45,21 @@ __all__ = [
     "init_seeds",
     "is_batching_faster",
     "learner_shape",
+    "merge_metrics",
 ]
 
 MIN_SPEED_UP = 2.0
-"""A smaller speed-up may be noise, and then equal runs would choose differently."""
+"""The speed-up from which `is_batching_faster` is true. A smaller one may be noise, and then equal runs would choose differently."""
 N_REPETITIONS = 5
-"""How often `is_batching_faster` times a factorisation."""
+"""How often `is_batching_faster` times the factorisations."""
 N_STARTS = 3
 """The number of starts of `evidence.fit`. Each start factorises a matrix."""
 MIN_FEATURES = 32
-"""The least size of the matrices that it factorises."""
+"""The least size of the matrices that `is_batching_faster` factorises."""
 
 
 class CompiledFunctions(NamedTuple):
-    """The functions of a run. All but `init` and `assess` consume their learner: its buffers are reused for the new one."""
+    """The functions of a run. `store`, `learn_returns`, `fit` and `train_step` consume their learner: the new one reuses its buffers."""
 
     init: Callable[[Key[Array, " seeds"]], Learner]
     """Return untrained learners."""
@@ -71,8 +72,8 @@ class CompiledFunctions(NamedTuple):
     fit: Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, Metrics]]
     """Make the decoders' own gradient updates. Return the mean of each metric."""
     train_step: Callable[..., tuple[Learner, Metrics]]
-    """Update the algorithm, from learner, newest steps (which are stored), keys, and the number of environment steps
-    before. Return the mean of each metric."""
+    """Update the algorithm. The arguments are the learner, the newest steps (which are stored), keys, and the number of environment
+    steps before them. Return the mean of each metric."""
     assess: Callable[[Learner], Metrics]
     """Compare proxy rewards with true rewards."""
 
@@ -124,9 +125,9 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
 def compile_ahead(
     config: TrainConfig, phi: Sequence[Graph], n_seeds: int, *, iterates_on_host: bool
 ) -> CompiledFunctions:
-    """Return the functions of a run, compiled for the shapes that they will see, before the run needs its memory.
+    """Return the functions of a run, compiled before the replay is made.
 
-    The compiler needs hundreds of megabytes for a while. This memory is returned to the system before the replay is made.
+    The compiler needs hundreds of megabytes for a while. They are returned to the system, so that the replay can use them.
     """
     functions = compile_functions(config, phi)
     learner = learner_shape(config, n_seeds)
@@ -162,14 +163,15 @@ def _compile(function: Any, *shapes: Any) -> Any:
 
 
 def _free_memory() -> None:
-    """Return memory that the compiler has freed to the system. Otherwise, glibc keeps it for the process."""
-    with contextlib.suppress(ImportError, OSError, TypeError, AttributeError):  # only glibc has it
+    """Make glibc return memory to the system that the compiler has freed. Other C libraries have no such function."""
+    with contextlib.suppress(ImportError, OSError, TypeError, AttributeError):
         import ctypes
 
         ctypes.CDLL(None).malloc_trim(0)
 
 
 IsMeasured = dict[str, Bool[Array, " seeds"]]
+"""For which seeds a metric has been measured, by its name."""
 
 
 class LoopState(NamedTuple):
@@ -180,7 +182,7 @@ class LoopState(NamedTuple):
     metrics: Metrics
     """The metrics of the newest updates."""
     is_measured: IsMeasured
-    """For which seeds they have been measured."""
+    """Whether they have been measured, in this call or before."""
     steps: Trajectory
     """The newest steps, for the message about a factor that is not finite."""
     is_finite: Bool[Array, " seeds"]
@@ -192,9 +194,8 @@ def compile_loop(env: JaxEnv, config: TrainConfig, phi: Sequence[Graph], n_seeds
     """Compile the iterations of a run. `phi` holds the graph of each team's phi.
 
     Returns:
-        A function from the learner and the environments, which it consumes, the metrics of the newest updates (empty before the first), the
-        seeds, the number of iterations before, and the number of iterations to make. A device stops after an iteration with a factor that
-        is not finite.
+        `_run_loop` without its first two arguments. It consumes the learner and the environments. A device stops after an iteration with
+        a factor that is not finite.
     """
 
     def loop(
@@ -225,7 +226,10 @@ def _run_loop(
     n_done: int,
     n_iterations: int,
 ) -> LoopState:
-    """Run the program of `compile_loop`. `shape` is the state of the loop with shapes instead of arrays."""
+    """Make `n_iterations` iterations after `n_done`.
+
+    `shape` is the state of the loop with shapes instead of arrays. `metrics` are those of the newest updates, empty before the first.
+    """
 
     def fill(leaf: Any, value: int) -> Array:
         return jnp.full(leaf.shape, value, leaf.dtype, device=leaf.sharding)
@@ -266,23 +270,23 @@ def _iterate(
     config: TrainConfig,
     phi: Sequence[Graph],
 ) -> LoopState:
-    """Make one iteration, in the order of `Session.advance`."""
+    """Make one iteration, in the order of `Session.advance`. `number` is the number of iterations before."""
     env_steps = number * config.iteration_steps
 
     def learn(learner: Learner) -> Learner:
         with float64():
             return learn_returns(learner, config)
 
-    def fit(learner: Learner, old: Metrics, is_measured: IsMeasured) -> tuple[Learner, Metrics, IsMeasured]:
-        learner, metrics = fit_seeds(learner, stream_keys(seeds, Stream.FIT, env_steps), config)
-        return learner, *_record(old, is_measured, metrics)
+    def fit(before: LoopState) -> LoopState:
+        learner, metrics = fit_seeds(before.learner, stream_keys(seeds, Stream.FIT, env_steps), config)
+        return _record(before, learner, metrics)
 
-    def fit_and_update(learner: Learner, old: Metrics, is_measured: IsMeasured) -> tuple[Learner, Metrics, IsMeasured]:
+    def fit_and_update(before: LoopState) -> LoopState:
         if config.fits_separately:
-            is_due = number % config.fit_every == 0
-            learner, old, is_measured = jax.lax.cond(is_due, fit, _keep, learner, old, is_measured)
-        learner, metrics = _train_step_function(config)(learner, steps, seed_keys(seeds, env_steps + 1), env_steps)
-        return learner, *_record(old, is_measured, metrics)
+            before = jax.lax.cond(number % config.fit_every == 0, fit, lambda unchanged: unchanged, before)
+        train_step, keys = _train_step_function(config), seed_keys(seeds, env_steps + 1)
+        learner, metrics = train_step(before.learner, before.steps, keys, env_steps)
+        return _record(before, learner, metrics)
 
     actor = get_actor(state.learner.algorithm, env_steps, config)
     keys = stream_keys(seeds, Stream.EXPLORATION, env_steps)
@@ -291,20 +295,24 @@ def _iterate(
     if config.method.fit is not None:
         is_paid = jnp.any(steps.ended) | (not config.payments.only_at_end)
         learner = jax.lax.cond(is_paid, learn, lambda unchanged: unchanged, learner)
-    updated = jax.lax.cond(env_steps >= config.warmup, fit_and_update, _keep, learner, state.metrics, state.is_measured)
-    learner, metrics, is_measured = updated
-    return LoopState(learner, envs, metrics, is_measured, steps, is_finite)
+    state = state._replace(learner=learner, envs=envs, steps=steps, is_finite=is_finite)
+    return jax.lax.cond(env_steps >= config.warmup, fit_and_update, lambda unchanged: unchanged, state)
 
 
-def _keep(*state: Any) -> tuple[Any, ...]:
-    return state
+def _record(state: LoopState, learner: Learner, new: Metrics) -> LoopState:
+    """Return the state after updates, with the learner and the metrics that they return."""
+    metrics, is_new = merge_metrics(state.metrics, new)
+    is_measured = state.is_measured | {name: state.is_measured[name] | is_new for name in new}
+    return state._replace(learner=learner, metrics=metrics, is_measured=is_measured)
 
 
-def _record(old: Metrics, is_measured: IsMeasured, metrics: Metrics) -> tuple[Metrics, IsMeasured]:
-    """Replace the metrics of the seeds that made updates or, if updates are not counted, of all seeds."""
-    is_new = metrics.get("algorithm/updates", 1) > 0
-    new = {name: jnp.where(is_new | ~is_measured[name], values, old[name]) for name, values in metrics.items()}
-    return old | new, is_measured | {name: is_measured[name] | is_new for name in metrics}
+def merge_metrics(old: Metrics, new: Metrics) -> tuple[Metrics, Bool[Array, " seeds"] | bool]:
+    """Return the metrics of each seed's last updates, and which seeds the new updates were made for."""
+    if "algorithm/updates" not in new:  # only QMIX and VDN count updates, because seeds make different numbers of them
+        return old | new, True
+    is_new = new["algorithm/updates"] > 0
+    keeps_old = ~is_new & (old.get("algorithm/updates", 0) > 0)
+    return old | {name: jnp.where(keeps_old, old.get(name, values), values) for name, values in new.items()}, is_new
 
 
 def is_batching_faster(config: TrainConfig, n_seeds: int) -> bool:

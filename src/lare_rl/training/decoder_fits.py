@@ -44,8 +44,7 @@ __all__ = [
 ]
 
 CHUNK_ROWS = 2400
-"""The size of a chunk of a decoder's gradient, in rows. More rows do not fit into the cache of a core, and fewer make the matrix products
-inefficient."""
+"""The most rows of a chunk of a decoder's gradient. More do not fit into the cache of a core; fewer make matrix products inefficient."""
 
 MIN_FIRST_EPISODES = 10
 """With fewer finished episodes of a seed, the first fit waits, and decoders are fitted as published."""
@@ -54,13 +53,12 @@ PATIENCE = 2
 MAX_ROUNDS = 40
 """The most rounds of a first fit."""
 BATCH_DIVISOR = 8
-"""Updates of the first fit read this fraction of the steps of later updates. There are few episodes yet, and large
-updates would read each of them several times. The decoder becomes as accurate in an eighth of the time
-(benchmarks/first_fit.py)."""
+"""An update of the first fit reads the steps of a later update, divided by this. There are few episodes yet, and large updates would
+read each of them several times. The decoder becomes as accurate in an eighth of the time (benchmarks/first_fit.py)."""
 
 
 class FirstFitStoppedError(Exception):
-    """The user asked the run to stop during the first fit. Nothing of this iteration is kept."""
+    """The user asked the run to stop during the first fit. Its iteration is lost."""
 
 
 def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: CreditConfig) -> CreditSample:
@@ -129,17 +127,15 @@ def fit_repeatedly(learner: Learner, key: PRNGKeyArray, config: CreditConfig) ->
 
 
 def has_enough_episodes(learner: Learner) -> bool:
-    """Return whether every seed has episodes to hold out."""
+    """Return whether every seed has enough episodes for the first fit."""
     n_episodes = jax.vmap(replay.n_stored_episodes)(replay.segments_as_episodes(learner.replay))
     return int(jnp.min(jnp.sum(n_episodes, axis=1))) >= MIN_FIRST_EPISODES
 
 
 def config_of_first_fit(config: TrainConfig) -> TrainConfig:
-    """Return the configuration of the first fit: updates read fewer steps, and at least an episode."""
-    steps = max(config.credit.steps // BATCH_DIVISOR, config.longest_segment)
-    return dataclasses.replace(
-        config, credit=config.credit.model_copy(update={"steps": min(steps, config.credit.steps)})
-    )
+    """Return the configuration of the first fit, whose updates read fewer steps, but at least those of an episode."""
+    steps = max(config.credit.steps // BATCH_DIVISOR, min(config.longest_segment, config.credit.steps))
+    return dataclasses.replace(config, credit=config.credit.model_copy(update={"steps": steps}))
 
 
 def fit_until_converged(
@@ -160,7 +156,7 @@ def fit_until_converged(
     Raises:
         FirstFitStoppedError: the user has asked the run to stop.
     """
-    # Copies, here and below, because each round consumes its learner.
+    # The learner is copied, here and below, because each round consumes it.
     hidden_fields = ("current_episode", "running", "segments")
     unhidden = {name: jax.tree.map(jnp.copy, getattr(learner.replay, name)) for name in hidden_fields}
     n_hidden = jax.vmap(partial(_count_held_out, window=config.credit_specs[0].window))(

@@ -1,9 +1,7 @@
 """What the decoders read: the factors of collected steps, and the inputs from the columns of stored steps.
 
-The graph of phi computes factors inside a compiled function, or with NumPy on the host.
-
-An array of the decoder's inputs has an axis for the team's proxy rewards: one for each agent, or a single one if credit goes to
-whole teams.
+In arrays of a decoder's inputs, the axis `rows` has one row for each proxy reward of the team: one for each agent, or a single one if
+credit goes to whole teams.
 """
 
 from collections.abc import Sequence
@@ -44,22 +42,19 @@ __all__ = [
 
 MAX_COMPILED_OPERATIONS, MAX_COMPILED_DEPTH = 400, 200
 """Graphs with more operations, or with a longer chain of them, are computed by NumPy: XLA would compile for too long."""
-
 FAILED_BATCH = "failed_batch.npz"
+"""The file in the run's directory with the inputs of a factor that is not finite."""
 
 
 def is_compilable(graph: Graph) -> bool:
-    """Return whether a graph becomes part of a compiled function."""
+    """Return whether XLA compiles a graph. If not, a compiled function calls NumPy."""
     return len(graph.operations) <= MAX_COMPILED_OPERATIONS and graph.depth <= MAX_COMPILED_DEPTH
 
 
 def compute_factors(
     graphs: Sequence[Graph], steps: Trajectory, config: CreditConfig
 ) -> Float[Array, "*lead rows factors"]:
-    """Compute the factors z of steps inside a compiled function, by each team's phi.
-
-    They are padded to the largest number of factors.
-    """
+    """Compute the factors z of steps inside a compiled function, by each team's phi, padded to the largest number of factors."""
     lead = steps.next_timestep.terminated.shape
     factors = jnp.zeros((*lead, config.n_proxy_rewards, max(config.n_factors, default=0)), jnp.float32)
     for i, (graph, team) in enumerate(zip(graphs, config.env.teams, strict=False)):
@@ -83,10 +78,10 @@ def _evaluate_graph(graph: Graph, observation: Array, action: Array) -> Float[Ar
 
 
 def compute_host_factors(run: Run, config: CreditConfig, steps: Trajectory) -> Float[np.ndarray, "*lead rows factors"]:
-    """Compute the factors z of steps on the host. They are empty for a method without phi.
+    """Compute `compute_factors` on the host. The last axis is empty for a method without phi.
 
     Raises:
-        LareError: a factor is not finite. Its batch is saved in the run directory, so that the user can inspect it.
+        LareError: a factor is not finite. Its inputs are saved in the run directory, so that the user can inspect them.
     """
     steps = jax.tree.map(np.asarray, steps)
     lead = steps.env_action.shape[:-2]
@@ -107,9 +102,9 @@ def compute_host_factors(run: Run, config: CreditConfig, steps: Trajectory) -> F
 def decoder_inputs(
     steps: StoredSteps, config: CreditConfig, team_index: int, names: tuple[str, ...] | None = None
 ) -> Float[Array, "*batch rows inputs"]:
-    """Return the inputs of a team's decoder for some steps, or those of these names."""
-    names = config.credit_specs[team_index].inputs if names is None else names
+    """Return the inputs of a team's decoder for some steps. By default, `names` are all of its inputs."""
     spec, agents = config.credit_specs[team_index], config.team_slice(team_index)
+    names = spec.inputs if names is None else names
     if not names:
         return jnp.zeros((*steps.episode_ended.shape, spec.agents, 0))
     columns, next_columns = steps.columns, steps.next_columns
@@ -131,7 +126,7 @@ def decoder_inputs(
 
 
 def tracked_inputs(steps: StoredSteps, config: CreditConfig) -> Float[Array, "*batch rows entries"]:
-    """Return the entries whose history is stored, of all teams, padded to the largest number."""
+    """Return the inputs of all teams whose history is stored, padded to the largest number."""
     entries = jnp.zeros((*steps.episode_ended.shape, config.n_proxy_rewards, config.n_tracked))
     for i, spec in enumerate(config.credit_specs):
         n_tracked = spec.basis.n_tracked
@@ -155,9 +150,9 @@ def row_mask(steps: StoredSteps, config: CreditConfig, team_index: int) -> Bool[
 
 
 def step_batch(steps: StoredSteps, config: CreditConfig, team_index: int) -> StepBatch:
-    """Return the steps as the rewards are computed from them."""
+    """Return the steps from which `credit.rewards` computes a team's rewards."""
     length = steps.length
-    if config.payments.window is not None:  # steps that are not paid yet: most payments are for the whole window
+    if config.payments.window is not None:  # most payments are for a full window, so those to come are expected to be
         length = jnp.where(steps.episode_ended, length, config.longest_segment)
     return StepBatch(
         inputs=decoder_inputs(steps, config, team_index),
@@ -171,7 +166,7 @@ def step_batch(steps: StoredSteps, config: CreditConfig, team_index: int) -> Ste
 
 
 def episode_batch(steps: StoredSteps, sample: CreditSample, config: CreditConfig, team_index: int) -> CreditBatch:
-    """Return the batch that a team's decoder is fitted to, from the sampled steps."""
+    """Return the batch that a team's decoder is fitted to, from a sample and its steps."""
     episodes = sample.episodes
     return CreditBatch(
         inputs=decoder_inputs(steps, config, team_index),

@@ -1,10 +1,9 @@
 """How the decoders learn from finished episodes: predict their returns, add them to sufficient statistics, fit.
 
-Every method that predicts returns has this order, so that `credit/return_r2` is measured on returns before anything is
-fitted to them.
+In this order, `credit/return_r2` is measured on returns before anything is fitted to them.
 
-The functions are written for all seeds: steps are read in lockstep, and closed-form fits are made when they are due, of
-all seeds at once or of one after the other (`batched`). Call them within `float64()`, because `closed_form.py` needs float64.
+`learn_returns` is written for all seeds: steps are read in lockstep, and closed-form fits are made when they are due, of all seeds at
+once or of one after the other (`batched`). Call it within `float64()`, because `closed_form.py` needs float64.
 """
 
 from collections.abc import Callable
@@ -40,7 +39,7 @@ State = TypeVar("State")
 
 
 def learn_returns(learner: Learner, config: CreditConfig) -> Learner:
-    """Let the decoders learn from episodes that have finished, and predict returns anew. Every array has a leading seed axis."""
+    """Let decoders learn from finished episodes, and predict returns anew, when there are enough new ones. All arrays have a seed axis."""
     buffer, n_learned = replay.segments_as_episodes(learner.replay), learner.n_learned
     n_before = jnp.sum(n_learned, axis=1)
     n_new = jnp.sum(buffer.current_episode, axis=1) - n_before
@@ -58,7 +57,7 @@ def learn_returns(learner: Learner, config: CreditConfig) -> Learner:
 
 
 def predict_returns(learner: Learner, since: Int[Array, " envs"], config: CreditConfig) -> Learner:
-    """Return the learner of one seed with the predicted returns of the episodes from `since` on, computed anew."""
+    """Predict the returns of one seed's episodes anew, from the episode `since` of each environment on, and store them in the replay."""
     buffer = replay.segments_as_episodes(learner.replay)
     slots = buffer.first.shape[-1]
 
@@ -105,7 +104,7 @@ def _learn_if_due(
 
 
 def _closed_forms(decoders: Decoders) -> tuple[ClosedForm, ...]:
-    """Return the fits in closed form of all teams; none if the method has none."""
+    """Return the fit in closed form of each team; empty if the method has none."""
     return tuple(decoder.closed_form for decoder in decoders if decoder.closed_form is not None)
 
 

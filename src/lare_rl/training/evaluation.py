@@ -16,14 +16,7 @@ from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.policy import compile_policy
 from lare_rl.training.rewards import team_metrics
 
-__all__ = [
-    "EpisodeBatch",
-    "Evaluation",
-    "concatenate",
-    "greedy_actions",
-    "metrics_lines",
-    "saturation",
-]
+__all__ = ["EpisodeBatch", "Evaluation", "greedy_actions", "metrics_lines", "saturation"]
 
 N_STATES = 1000
 """The number of stored observations in which the saturation of a policy is measured."""
@@ -39,7 +32,7 @@ class EpisodeBatch(NamedTuple):
     mask: Bool[AnyArray, "time seeds episodes"]
     """Whether the episode had not ended before the step."""
     state: Any
-    """The states after each step of an environment of pure functions, [time seeds episodes ...]; None on the host."""
+    """The state of the environment after each step, [time seeds episodes ...]; None on the host."""
 
 
 class Evaluation(NamedTuple):
@@ -55,7 +48,7 @@ class Evaluation(NamedTuple):
     """The task's own measures and the group, from the last step."""
 
     def drop_group(self, task: TaskSpec) -> "Evaluation":
-        """Return the evaluation without the numbers of the groups, whose mean says nothing, unless the task measures them."""
+        """Return the evaluation without the measure of the group, whose mean says nothing, unless the task lists it as a measure."""
         names = [name for name in self.measures if name != task.group or name in task.measures]
         return self._replace(measures={name: self.measures[name] for name in names})
 
@@ -73,11 +66,6 @@ class Evaluation(NamedTuple):
         return metrics | team_metrics(per_team, spec.teams)
 
 
-def concatenate(evaluations: Sequence[Evaluation]) -> Evaluation:
-    """Concatenate the episodes of evaluations of the same seeds."""
-    return jax.tree.map(lambda *arrays: np.concatenate(arrays, axis=1), *evaluations)
-
-
 def metrics_lines(seeds: Sequence[int], step: int, metrics: Mapping[str, Any], rate: float) -> list[dict[str, Any]]:
     """Return one line of metrics.jsonl for each seed, from arrays with one number for each seed."""
     lines = []
@@ -89,14 +77,12 @@ def metrics_lines(seeds: Sequence[int], step: int, metrics: Mapping[str, Any], r
     return lines
 
 
-def greedy_actions(
-    actor: Any, replay: Replay, config: TrainConfig, n_states: int = N_STATES
-) -> Float[np.ndarray, "seeds states action"]:
-    """Return actions of an off-policy algorithm without noise, in the newest states of the first environment.
+def greedy_actions(actor: Any, replay: Replay, config: TrainConfig) -> Float[np.ndarray, "seeds states action"]:
+    """Return an off-policy algorithm's actions without noise at the newest `N_STATES` observations of the first environment.
 
     If fewer are stored, they are repeated: the shape, and so the compiled program, is always the same.
     """
-    rows = np.asarray(replay.next_row)[:, :1] - 1 - np.arange(n_states) % int(np.min(replay.next_row))
+    rows = np.asarray(replay.next_row)[:, :1] - 1 - np.arange(N_STATES) % int(np.min(replay.next_row))
     observation = jax.vmap(lambda column, seed_rows: column[0, seed_rows])(
         replay.columns["observation"], rows % capacity(replay)
     )
@@ -105,10 +91,10 @@ def greedy_actions(
     return np.asarray(act(actor, (), observation, available, None, np.zeros(rows.shape, bool))[0])[:, :, 0]
 
 
-def saturation(action: Float[np.ndarray, "seeds steps action"]) -> Float[np.ndarray, " seeds"]:
+def saturation(action: Float[np.ndarray, "seeds states action"]) -> Float[np.ndarray, " seeds"]:
     """Return the fraction of an action's components that are at the same bound in all states.
 
-    Each seed's policy has chosen the actions in the same states, without noise, between -1 and 1.
+    The actions are without noise, and lie in [-1, 1].
     """
     bound = np.where(np.abs(action) > ACTION_BOUND, np.sign(action), 0)
     return np.mean((bound[:, 0] != 0) & np.all(bound == bound[:, :1], axis=1), axis=-1)

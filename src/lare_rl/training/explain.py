@@ -41,13 +41,13 @@ def explain_run(run: Run) -> list[str]:
 
 
 def find_explanations(run: Run) -> list[list[Finding]]:
-    """Return the findings about the returns in a run's last checkpoint, for each team: those of `explanation_findings`."""
+    """Return the findings about the returns in a run's last checkpoint, for each team."""
     config, learner, _, _ = load_learner(run)
     return _find_explanations(run, learner, config)
 
 
 def explanation_source(run: Run) -> str:
-    """Return which seed and which fit an explanation is of. It is empty where that goes without saying."""
+    """Return which seed an explanation is of, and by which fit. Empty for the only seed and its decoder."""
     method = METHODS.find(run.config.settings.method)
     remarks = [f"of seed {run.seeds[0]} alone"] if len(run.seeds) > 1 else []
     if method is not METHODS[_explaining_method(method)]:
@@ -69,15 +69,13 @@ def describe_returns(run: Run, learner: Learner, config: TrainConfig, legend: bo
 
 
 def _find_explanations(run: Run, learner: Learner, config: TrainConfig) -> list[list[Finding]]:
-    findings, roles, specs = [], run.config.task.roles, _explanation_config(config).credit_specs
+    findings, fitted_specs = [], _explanation_config(config).credit_specs
     for i, explanation in enumerate(explain_stored_returns(learner, config)):
-        role, function = roles[i], run.functions[i] if run.functions else None
-        factor_names = [] if function is None else function.factor_columns(run.scored_observation)
-        raw_names = [] if config.team_level else specs[i].raw_feature_names(role.observation, role.action)
+        role, spec = run.config.task.roles[i], config.credit_specs[i]
+        factor_names = run.functions[i].factor_columns(run.scored_observation) if run.functions else []
+        raw_names = [] if config.team_level else fitted_specs[i].raw_feature_names(role.observation, role.action)
         decoder = select_seed(first_shard(learner.decoders[i]))
-        spec = config.credit_specs[i]
-        levels = range(spec.n_levels)
-        findings.append(returns_findings(explanation, decoder, spec, factor_names, raw_names, levels))
+        findings.append(returns_findings(explanation, decoder, spec, factor_names, raw_names, range(spec.n_levels)))
     return findings
 
 
@@ -86,27 +84,29 @@ def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explan
 
     The list is empty for a method that fits nothing to returns, and for fewer than `MIN_EXPLAINED_EPISODES` episodes.
     """
-    fits, replay = config.method.fit is not None, segments_as_episodes(learner.replay)
-    config = _explanation_config(config)
+    replay = segments_as_episodes(learner.replay)
     n_stored = np.sum(np.asarray(replay.current_episode)[0] - np.asarray(replay.oldest)[0])
-    has_features = all(spec.basis.n_features for spec in config.credit_specs)
-    if not fits or not has_features or n_stored < MIN_EXPLAINED_EPISODES:
+    if not _can_explain(config) or n_stored < MIN_EXPLAINED_EPISODES:
         return []
     with float64():
-        explanations = _compile(config)(*first_shard((replay, _score_facts(learner))))
+        explanations = _compile(_explanation_config(config))(*first_shard((replay, _score_facts(learner))))
         return jax.tree.map(np.asarray, explanations)
 
 
 def compile_explanation(learner: Learner, config: TrainConfig) -> None:
     """Compile `explain_stored_returns` for a learner of these shapes, on one device, also in another thread."""
-    fits, replay = config.method.fit is not None, segments_as_episodes(learner.replay)
-    config = _explanation_config(config)
-    if not fits or not all(spec.basis.n_features for spec in config.credit_specs):
+    if not _can_explain(config):
         return
-    inputs = replay, jax.eval_shape(_score_facts, learner)
+    inputs = segments_as_episodes(learner.replay), jax.eval_shape(_score_facts, learner)
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), inputs)
     with jax.enable_x64(True):
-        _compile(config).lower(*shapes).compile()
+        _compile(_explanation_config(config)).lower(*shapes).compile()
+
+
+def _can_explain(config: TrainConfig) -> bool:
+    """Return whether the run's method is fitted to returns, and the explanation has features."""
+    has_features = all(spec.basis.n_features for spec in _explanation_config(config).credit_specs)
+    return config.method.fit is not None and has_features
 
 
 def _explaining_method(method: Method) -> str:
@@ -128,7 +128,6 @@ def _explanation_config(config: TrainConfig) -> TrainConfig:
 
 @cache_by_value
 def _compile(config: TrainConfig) -> Any:
-    """Return the compiled `_explain_first_seed`."""
     return jax.jit(partial(_explain_first_seed, config=config))
 
 
@@ -150,7 +149,10 @@ def _explain_first_seed(replay: Replay, score_facts: _ScoreFacts, config: TrainC
     states = fold_episodes(
         states, buffer, buffer.oldest, lambda state, batch, _: add_to_explanation(state, batch), config
     )
-    return [explain(state, mean.astype(int), start) for state, (mean, start) in zip(states, score_facts, strict=True)]
+    return [
+        explain(state, is_average.astype(int), start)
+        for state, (is_average, start) in zip(states, score_facts, strict=True)
+    ]
 
 
 def _observe(statistics: RunningMeanStd, episodes: CreditBatch, first: Index) -> RunningMeanStd:

@@ -23,9 +23,7 @@ FunctionOrPath = LatentFunction | str | Path
 def choose_functions(
     task: TaskSpec, settings: ResolvedSettings, function: FunctionOrPath | Sequence[FunctionOrPath] | None
 ) -> tuple[LatentFunction, ...]:
-    """Return one function for each role of the task: the user's, or from the shipped recordings.
-
-    It is empty for a method without phi.
+    """Return one function for each role of the task: the user's, or from the shipped recordings. Empty for a method without phi.
 
     Raises:
         LareError: a function cannot be used, or the method needs none.

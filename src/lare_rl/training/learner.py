@@ -1,7 +1,7 @@
 """The training state of a run: the replay, the decoders, and the algorithm. Steps are stored here.
 
-Only the modules of this room know both credit and algorithm: `credit` does not know the algorithm, and the algorithm does not
-know which method computes its rewards. A team is a group of agents that share a return, and each team has its own decoder.
+`credit` does not know the algorithm, and the algorithm does not know which method computes its rewards. A team is a group of agents
+that share a return, and each team has its own decoder.
 
 Functions are written for one seed; `compiled.py` adds the leading seed axis.
 """
@@ -38,10 +38,10 @@ __all__ = [
 
 
 class Learner(NamedTuple):
-    """The whole training state of one seed."""
+    """The training state of one seed."""
 
     algorithm: Any
-    """The state of the algorithm."""
+    """The state that `policy.init_algorithm` returns."""
     decoders: tuple[DecoderState, ...]
     """The decoder of each team."""
     replay: Replay
@@ -61,16 +61,15 @@ def init_learner(key: PRNGKeyArray, config: CreditConfig, init_algorithm: Callab
 
 
 def empty_replay(config: CreditConfig, n_envs: int, capacity: int) -> Replay:
-    """Return a replay for steps of these environments, with all that the method reads of them."""
-    with_predictions, with_levels = config.is_exact, config.group is not None
-    n_teams = len(config.env.teams)
+    """Return an empty replay with the columns that the algorithm and the decoders read."""
+    n_teams, with_predictions, with_levels = len(config.env.teams), config.is_exact, config.group is not None
     return replay.init_replay(config.columns, n_envs, capacity, n_teams, config.payments, with_predictions, with_levels)
 
 
 def store(
     learner: Learner, steps: Trajectory, config: CreditConfig, phi: Sequence[Graph] = ()
 ) -> tuple[Learner, Bool[Array, ""]]:
-    """Compute the factors of new steps by each team's phi, and put both into the replay and the running statistics.
+    """Compute the factors of new steps by each team's phi, and store steps and factors (`store_with_factors`).
 
     Returns:
         The new learner, and whether all factors are finite.
@@ -88,7 +87,7 @@ def store_with_factors(
 ) -> Learner:
     """Put new steps into the replay and into the running statistics.
 
-    The decoders do not read the steps of agents where `scored` is false. The rewards of these steps count.
+    Where `scored` is false, the decoders do not read the step of an agent, but its reward counts.
     """
     columns, next_columns = replay_columns(steps, factors, config, scored)
     rewards = [team_mean(steps.next_timestep.reward, steps.timestep.alive, team) for team in config.env.teams]
@@ -103,7 +102,7 @@ def store_with_factors(
 
 
 def _with_history(before: Replay, buffer: Replay, n_steps: int, config: CreditConfig) -> Replay:
-    """Return the replay with the history of its newest steps, which `before` does not have yet."""
+    """Return the replay with the history of its newest steps. `before` is the replay without them."""
     last_step = replay.read(before, replay.newest_steps(before, 1))
     new_steps = replay.read(buffer, replay.newest_steps(buffer, n_steps))
     first = jnp.append(~replay.segments_as_episodes(before).running[:, None], new_steps.last[:, :-1], axis=1)
@@ -154,6 +153,6 @@ def _observe(decoder: DecoderState, steps: StoredSteps, config: CreditConfig, te
 def abandon_episodes(learner: Learner, abandoned: Bool[Array, " envs"]) -> Learner:
     """Return the learner without the running episodes of some environments."""
     buffer = abandon_running(learner.replay, abandoned)
-    # Payments of these episodes may have been learned from.
+    # The decoders may have learned from payments of these episodes.
     n_learned = jnp.minimum(learner.n_learned, replay.segments_as_episodes(buffer).current_episode)
     return learner._replace(replay=buffer, n_learned=n_learned)

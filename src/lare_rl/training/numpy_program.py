@@ -3,13 +3,13 @@
 A policy on the host is called once for each step. For a small network, most of the time of a compiled call is spent in waking up XLA's
 threads. The same operations in NumPy take a fraction of the time. The results agree except for rounding.
 
-Arrays that are not NumPy's can take the place of NumPy's arrays, with functions that have the names of NumPy's: `lare-rl export`
-computes the nodes of a graph like this.
+The arrays may be of another library, if it has functions with NumPy's names: `lare-rl export` builds the nodes of a graph like this.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +20,7 @@ __all__ = ["UnsupportedOperationError", "apply", "to_numpy"]
 
 Operation = Callable[..., Any]
 ArrayFunctions = Callable[[str], Operation]
-"""From a name of NumPy to the function. Raises `UnsupportedOperationError` if there is none."""
+"""From the name of a NumPy function to the function for these arrays. Raises `UnsupportedOperationError` if there is none."""
 
 
 class UnsupportedOperationError(Exception):
@@ -45,7 +45,7 @@ def to_numpy(function: Callable[..., Any], fixed: Any, *shapes: Any) -> Callable
 
     Returns:
         A function from the first argument, as NumPy arrays, to a function of the other arguments. What depends on the first argument
-        only is computed once.
+        alone is computed once.
 
     Raises:
         UnsupportedOperationError: the function has an operation that is not translated.
@@ -71,12 +71,13 @@ def to_numpy(function: Callable[..., Any], fixed: Any, *shapes: Any) -> Callable
 
 
 def apply(function: Callable[..., Any], shapes: Any, values: Any, array_functions: ArrayFunctions) -> Any:
-    """Call a function of JAX with arrays of another kind.
+    """Call a function of JAX with arrays of another library.
 
     Args:
         function: a function of one pytree of arrays, as for `to_numpy`.
-        shapes: the shapes and types of the arrays.
-        array_functions: the functions of these arrays.
+        shapes: the argument with the shape and type of each array instead of the array.
+        values: the argument with arrays of the other library.
+        array_functions: the functions of that library.
 
     Raises:
         UnsupportedOperationError: the function has an operation that is not translated.
@@ -112,7 +113,7 @@ def _new_register(registers: list[Any], value: Any = None) -> int:
 
 
 class _Translator(NamedTuple):
-    """Appends the calls of programs."""
+    """Appends the calls of a program, and of the programs that it calls."""
 
     array_functions: ArrayFunctions
     registers: list[Any]
@@ -134,18 +135,16 @@ class _Translator(NamedTuple):
             results = [_aval(atom) for atom in equation.outvars]
             if equation.primitive.name == "concatenate":
                 inputs = [i for i, atom in zip(inputs, equation.invars, strict=True) if math.prod(_aval(atom).shape)]
-            inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
-            if not any(math.prod(result.shape) for result in results):  # other libraries may have no empty arrays
+            if not any(math.prod(result.shape) for result in results):  # another library may have no empty arrays
                 outputs = [_new_register(self.registers, np.zeros(result.shape, result.dtype)) for result in results]
             elif equation.primitive.name == "dot_general":
                 outputs = [self._append_product(equation, inputs)]
             elif equation.primitive.name in INLINED:
-                assert inner is not None
-                outputs = self.translate(inner, inputs)
+                outputs = self.translate(equation.params.get("jaxpr") or equation.params["call_jaxpr"], inputs)
             elif equation.primitive.name == "split":
                 lead, stops = (slice(None),) * equation.params["axis"], np.cumsum(equation.params["sizes"]).tolist()
                 slices = [(*lead, slice(start, stop)) for start, stop in zip([0, *stops], stops, strict=False)]
-                outputs = [self._append(partial(_take, index=index), *inputs) for index in slices]
+                outputs = [self._append(itemgetter(index), *inputs) for index in slices]
             else:
                 outputs = [self._append(_find_operation(equation, self.array_functions), *inputs)]
             register.update(zip(equation.outvars, outputs, strict=True))
@@ -194,18 +193,17 @@ def _remove_unused(calls: list[_Call], results: Sequence[int]) -> list[_Call]:
 
 def _split_calls(calls: Sequence[_Call], arguments: Sequence[int]) -> tuple[list[_Call], list[_Call]]:
     """Return the calls that do not depend on these arguments, and the calls that depend on them."""
-    changing, once, each_time = set(arguments), [], []
+    dependent, once, each_time = set(arguments), [], []
     for call in calls:
-        if changing.isdisjoint(call.arguments):
+        if dependent.isdisjoint(call.arguments):
             once.append(call)
         else:
-            changing.add(call.result)
+            dependent.add(call.result)
             each_time.append(call)
     return once, each_time
 
 
 def _find_operation(equation: JaxprEqn, array_functions: ArrayFunctions) -> Operation:
-    """Return the NumPy function of an operation."""
     name, params = equation.primitive.name, equation.params
     inputs, result = [_aval(atom) for atom in equation.invars], _aval(equation.outvars[0])
     if name in ELEMENTWISE and not (name == "div" and np.issubdtype(inputs[0].dtype, np.integer)):
@@ -249,7 +247,7 @@ def _find_operation(equation: JaxprEqn, array_functions: ArrayFunctions) -> Oper
         case "slice":
             strides = params["strides"] or (1,) * len(params["start_indices"])
             bounds = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
-            return partial(_take, index=tuple(slice(*bound) for bound in bounds))
+            return itemgetter(tuple(slice(*bound) for bound in bounds))
         case "gather":
             return partial(array_functions("gather"), equation)
         case "iota":
@@ -265,12 +263,8 @@ def _find_operation(equation: JaxprEqn, array_functions: ArrayFunctions) -> Oper
     raise UnsupportedOperationError(name)
 
 
-def _take(x: Any, index: tuple[slice, ...]) -> Any:
-    return x[index]
-
-
 def _numpy_function(name: str) -> Operation:
-    """Return a function of NumPy. The methods of an array take less time than functions of the same name."""
+    """Return the function of NumPy with this name; the method of an array, which takes less time, if it is one of `METHODS`."""
     function = METHODS.get(name) or getattr(np, name, None)
     if function is None:
         raise UnsupportedOperationError(name)

@@ -27,7 +27,7 @@ __all__ = ["train_step"]
 def train_step(
     learner: Learner, steps: Trajectory, key: PRNGKeyArray, env_steps: Int[Scalar, ""], config: TrainConfig
 ) -> tuple[Learner, Metrics]:
-    """Update decoder and algorithm once for each new step of an environment. Of `steps`, only the number matters."""
+    """Update decoder and algorithm once for each new step of an environment. `steps` are not read, because they are stored."""
     sample_key, _, noise_key = jax.random.split(key, 3)
     algorithm, settings, buffer = config.algorithm.load(), config.hyperparameters, learner.replay
     assert isinstance(settings, OffPolicySettings)

@@ -1,6 +1,6 @@
 """Algorithms that consume rollouts: relabel the newest steps by the current decoder, and update the policy on them.
 
-Algorithm 1 of the LaRe paper, lines 6 to 8, for PPO and IPPO. The decoder was fitted to all stored episodes before.
+Algorithm 1 of the LaRe paper, lines 6 to 8, for PPO and IPPO. The decoder has been fitted before, to stored episodes.
 """
 
 import jax
@@ -22,7 +22,7 @@ __all__ = ["train_step"]
 def train_step(
     learner: Learner, steps: Trajectory, key: PRNGKeyArray, env_steps: Int[Scalar, ""], config: TrainConfig
 ) -> tuple[Learner, Metrics]:
-    """Update the policy on `steps`, which have just been stored."""
+    """Update the policy on `steps`, which have just been stored. Before them, each seed had made `env_steps` environment steps."""
     remaining = 1 - env_steps / config.steps
     rollout = _rollout(learner, jax.tree.map(jnp.asarray, steps), config)
     state, metrics = config.algorithm.load().update(learner.algorithm, rollout, key, remaining, config.hyperparameters)

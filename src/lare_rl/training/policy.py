@@ -3,7 +3,7 @@
 A policy is a function of the actor, its memory, the observation, the available actions, the noise (None: it acts without noise) and which
 episodes have just begun. It returns the action and the new memory. Only QMIX and VDN have a memory.
 
-A small network acts faster on the CPU with NumPy than on an accelerator, which needs two transfers and a launch for each step. The
+On the host, a small network acts faster with NumPy than on an accelerator, which needs two transfers and a launch for each step. The
 weights are copied once for many steps.
 """
 
@@ -61,7 +61,7 @@ def init_algorithm(key: PRNGKeyArray, config: TrainConfig) -> Any:
 
 
 def get_actor(state: Any, env_steps: int | Int[Array, ""], config: TrainConfig) -> Any:
-    """Return what is needed to act after `env_steps` environment steps, from the algorithm's state, of one seed or of all."""
+    """Return the actor after `env_steps` environment steps, from the algorithm's state of one seed or of all."""
     if config.consumes is Consumes.SEQUENCES:
         return sequences.get_actor(state, env_steps, config)
     return config.algorithm.load().get_actor(state)
@@ -129,7 +129,7 @@ def make_policy(config: TrainConfig, deterministic: bool) -> Policy:
 
 @cache_by_value
 def compile_policy(config: TrainConfig, deterministic: bool) -> Policy:
-    """Return `make_policy`, compiled."""
+    """Return the policy of `make_policy`, compiled."""
     return jit_over_seeds(make_policy(config, deterministic), config.n_devices)
 
 
@@ -143,7 +143,7 @@ def actor_shape(config: TrainConfig, n_seeds: int) -> Any:
 
 
 def make_host_policy(config: TrainConfig, actor: Any, n_envs: int, *, deterministic: bool) -> HostPolicy:
-    """Return the policy of all seeds, each in `n_envs` environments. If `deterministic`, it acts without noise."""
+    """Return the policy of all seeds, each in `n_envs` environments, with the weights that the actor has now."""
     bind = _translate_policy(config, len(jax.tree.leaves(actor)[0]), n_envs, deterministic)
     if bind is not None:
         return bind(jax.tree.map(np.array, jax.device_get(actor)))
@@ -155,7 +155,7 @@ def make_host_policy(config: TrainConfig, actor: Any, n_envs: int, *, determinis
 def _translate_policy(
     config: TrainConfig, n_seeds: int, n_envs: int, deterministic: bool
 ) -> Callable[[Any], HostPolicy] | None:
-    """Return the policy as a NumPy program, or None if it has an operation that cannot be translated."""
+    """Return a function from the actor to the policy as a NumPy program, or None if an operation cannot be translated."""
     env, lead = config.env, (n_seeds, n_envs)
 
     def shape(*sizes: int, dtype: Any = np.float32) -> jax.ShapeDtypeStruct:
@@ -179,6 +179,6 @@ def init_host_memory(config: TrainConfig, *lead: int) -> Any:
 def draw_noise(
     config: TrainConfig, rngs: Sequence[np.random.Generator], *lead: int
 ) -> Float[np.ndarray, "seeds *lead agents noise"]:
-    """Draw the noise of some steps, which are an array of shape `lead`. `rngs` has a generator for each seed."""
+    """Draw the noise of steps in an array of shape `lead`, by the random generator of each seed."""
     shape = *lead, config.env.n_agents, config.noise_size
     return np.stack([host_noise(rng, config.noise, shape) for rng in rngs])

@@ -17,12 +17,10 @@ from lare_rl.runs.directory import Run
 __all__ = ["catch_stop_signals", "report_full_memory"]
 
 STOP_SIGNALS = signal.SIGINT, signal.SIGTERM
-
 SAME_REQUEST_S = 1.0
 """Signals less than this many seconds apart count as one: a terminal and a parent process may each send one."""
-
 UNRESPONSIVE_S = 10.0
-"""The process ends if the main thread has not reacted to the second signal for so long (s): a simulator in C may hang in it."""
+"""How long (s) the main thread may take to react to the second signal: a simulator in C may hang in it. Then the process ends."""
 
 
 @contextlib.contextmanager
@@ -73,8 +71,8 @@ def catch_stop_signals() -> Iterator[threading.Event]:
 def _end_unresponsive_process() -> Iterator[None]:
     """End the process if the main thread does not react to the second signal.
 
-    Python calls its handlers in the main thread, between two steps of the interpreter. So they are not called while a simulator
-    hangs in C. A thread reads the numbers of the signals, which Python writes at once.
+    Python calls signal handlers in the main thread, between two steps of the interpreter: not while a simulator hangs in C. But it
+    writes the number of each signal to a descriptor at once, and another thread reads it there.
     """
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
@@ -88,15 +86,15 @@ def _end_unresponsive_process() -> Iterator[None]:
 
 
 def _wait_for_second_signal(receiver: socket.socket) -> None:
-    """Wait until the sender is closed, or end the process some seconds after the second request to stop."""
-    first_request = None
+    """End the process `UNRESPONSIVE_S` after the second request to stop, unless the sender is closed before."""
+    first_request_at = None
     with receiver:
         while number := receiver.recv(1):
             if number[0] not in STOP_SIGNALS:
                 continue
-            if first_request is None:
-                first_request = time.monotonic()
-            elif time.monotonic() - first_request > SAME_REQUEST_S:
+            if first_request_at is None:
+                first_request_at = time.monotonic()
+            elif time.monotonic() - first_request_at > SAME_REQUEST_S:
                 break
         receiver.settimeout(UNRESPONSIVE_S)
         try:

@@ -41,7 +41,7 @@ class Listener(Protocol):
         """An evaluation has been made. Its lines of metrics.jsonl and the checkpoint have been written."""
 
     def on_message(self, message: str) -> None:
-        """The user should read this line."""
+        """The run has a line for the user to read."""
 
     def on_stop(self) -> None:
         """The run has ended, also after an error. This is called exactly once."""
@@ -56,14 +56,14 @@ class Terminal(Listener):
         self._steps = 0
         self._has_evaluation = False
         self._has_compiled = False
-        """Whether the updates were compiled before the last evaluation, so that rates do not include it."""
+        """Whether the updates were compiled before the last evaluation. Rates since then do not include compiling."""
         self._line_step, self._line_time = 0, time.monotonic()
         """Step and time of the last line."""
         self._due_step: int | None = None
-        """The first step more than a minute after the last line."""
+        """The step at which a minute had passed since the last line. None before, and after an evaluation."""
 
     def on_start(self, name: str, step: int, steps: int) -> None:
-        self._steps = steps
+        self._steps, self._has_evaluation, self._has_compiled, self._due_step = steps, False, False, None
         self._line_step, self._line_time = step, time.monotonic()
         if self._console.is_terminal:
             columns = (
@@ -87,17 +87,16 @@ class Terminal(Listener):
             self._print_minute(step, seconds)
 
     def _print_minute(self, step: int, seconds: float) -> None:
-        """Print a line at the next step, or after another minute without one. An evaluation that ends before has its own line."""
-        if self._due_step is None:
+        """Print a line at the first step that is later than `_due_step`, or after another minute of evaluating."""
+        if self._due_step is None:  # not now: an evaluation may follow, which has its own line
             self._due_step = step
             return
-        n_steps, text = step - self._line_step, f"step {step:>{len(str(self._steps))}} of {self._steps}"
         if step > self._due_step:
-            rate = n_steps / seconds
+            rate = (step - self._line_step) / seconds
             remark = self._time_left(step, rate) if self._has_compiled else " with compiling"
-            self.on_message(f"{text}: {rate:.3g} steps/s{remark}")
+            self._print_step(step, f"{rate:.3g} steps/s{remark}")
         elif seconds > 2 * LINE_S:
-            self.on_message(f"{text}: evaluating")
+            self._print_step(step, "evaluating")
         else:
             return
         self._line_step, self._line_time, self._due_step = step, time.monotonic(), None
@@ -107,15 +106,18 @@ class Terminal(Listener):
         self._line_step, self._line_time = metrics[0]["step"], time.monotonic()
         if self._progress:
             self._progress.update(self._progress.task_ids[0], figures=_summarise(metrics))
+            return
+        step, is_trained = metrics[0]["step"], any(map(was_updated, metrics))
+        rate = _mean(metrics, "time/steps_per_second") or 0.0
+        if self._has_compiled:
+            text = f"{_summarise(metrics)}{self._time_left(step, rate)}"
         else:
-            step, steps = metrics[0]["step"], self._steps
-            is_trained = any(map(was_updated, metrics))
-            rate = _mean(metrics, "time/steps_per_second") or 0.0 if self._has_compiled else 0.0
-            compiling = " with compiling" if is_trained and not self._has_compiled else ""
-            self._has_compiled |= is_trained
-            self.on_message(
-                f"step {step:>{len(str(steps))}} of {steps}: {_summarise(metrics, compiling)}{self._time_left(step, rate)}"
-            )
+            text = _summarise(metrics, " with compiling" if is_trained else "")
+        self._has_compiled |= is_trained
+        self._print_step(step, text)
+
+    def _print_step(self, step: int, text: str) -> None:
+        self.on_message(f"step {step:>{len(str(self._steps))}} of {self._steps}: {text}")
 
     def on_message(self, message: str) -> None:
         self._console.print(sanitize(message), highlight=False, markup=False, soft_wrap=True)
@@ -131,7 +133,7 @@ class Terminal(Listener):
         return f", {format_for_reader((self._steps - step) / rate, 'seconds')} left"
 
 
-_SUMMARY = {
+SUMMARY = {
     "evaluation/return": "return {:.1f}",
     "evaluation/deterministic_return": "deterministic {:.1f}",
     "evaluation/won": "won {:.2f}",
@@ -139,11 +141,12 @@ _SUMMARY = {
     "credit/correlation": "correlation {:.2f}",
     "credit/return_r2": "R² of returns {:.2f}",
 }
+"""Metrics in the line of an evaluation, and how they are shown."""
 
 
 def _summarise(metrics: MetricLines, remark: str = "") -> str:
-    """Return the main metrics in one line, as means over the seeds, with a remark on the rate."""
-    means = {template: _mean(metrics, key) for key, template in _SUMMARY.items()}
+    """Return the steps per second, with a remark, and the metrics of `SUMMARY`, as means over the seeds."""
+    means = {template: _mean(metrics, key) for key, template in SUMMARY.items()}
     texts = [template.format(mean) for template, mean in means.items() if mean is not None]
     return ", ".join([f"{_mean(metrics, 'time/steps_per_second') or 0:.0f} steps/s{remark}", *texts])
 
@@ -166,12 +169,12 @@ class TensorBoard(Listener):
     """Every number of metrics.jsonl as TensorBoard events, with one writer for each seed."""
 
     def __init__(self, directory: Path, step: int, seeds: Sequence[int]):
-        writer = import_summary_writer()
+        summary_writer = import_summary_writer()
         # Events that an earlier process wrote after the checkpoint are purged, because they are written again.
         purge = step + 1 if step else None
         # Files are named by the second: a run that is resumed within the same second must not overwrite its own events.
         options = {"purge_step": purge, "flush_secs": 10, "filename_suffix": f".{step}"}
-        self._writers = {seed: writer(str(directory / f"seed-{seed}"), **options) for seed in seeds}
+        self._writers = {seed: summary_writer(str(directory / f"seed-{seed}"), **options) for seed in seeds}
 
     def on_evaluation(self, metrics: MetricLines) -> None:
         for line in metrics:

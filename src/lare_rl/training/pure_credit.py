@@ -11,8 +11,9 @@ All shapes are fixed. The functions can be jitted, and mapped by `vmap`, `scan` 
 `state.n_invalid` should stay 0: it counts the steps for which `phi` gave a number that is not finite.
 """
 
+import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,7 @@ from lare_rl.data.replay import StoredSteps, mean_length, required_capacity, seg
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, to_env_action
 from lare_rl.envs.vec_env import empty_batch
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, check_count, short_repr
 from lare_rl.latent.function import LatentFunction
 from lare_rl.phi.graph import Graph
 from lare_rl.tasks.spec import ScoredObservation
@@ -60,14 +61,14 @@ class PureCreditState(NamedTuple):
     """The state of credit assignment."""
 
     learner: Learner
-    """The stored steps, and the decoder."""
+    """The stored steps, and the decoder. It trains no algorithm."""
     n_invalid: Int[Array, ""]
     """For how many steps of an agent `phi` has given a factor that is not finite. The decoder does not read them, and their proxy
     rewards are 0."""
 
 
 class PureCredit(NamedTuple):
-    """The functions."""
+    """The functions that `pure_credit` returns."""
 
     init: Callable[[PRNGKeyArray], PureCreditState]
     """Return the state before the first step."""
@@ -107,7 +108,7 @@ def pure_credit(
         action_size: the length of a continuous action, or the number of discrete actions.
         n_envs: the number of environments.
         n_steps: the steps of each environment that `observe` stores at a time.
-        max_steps: the length of the longest episode. The decoder does not learn from longer ones.
+        max_steps: the number of steps of the longest episode. The decoder does not learn from longer ones.
         discrete: whether actions are discrete.
         agents: the number of agents of a team, which shares its return.
         low: the lower bounds of continuous actions in the environment's units, which `phi` reads.
@@ -121,6 +122,13 @@ def pure_credit(
     Raises:
         LareError: the arguments do not go together.
     """
+    counts = {"observation_size": observation_size, "action_size": action_size, "n_envs": n_envs, "n_steps": n_steps}
+    for name, value in (counts | {"max_steps": max_steps, "agents": agents, "capacity": capacity}).items():
+        check_count(name, value)
+    if scored_observation not in get_args(ScoredObservation):
+        raise LareError(f"scored_observation = {short_repr(scored_observation)}: give 'before', 'after' or 'both'")
+    if not isinstance(settings, CreditSettings | None):
+        raise LareError(f"settings must be a lare_rl.CreditSettings, and are {short_repr(settings)}")
     chosen, credit = METHODS.find(method), settings or default_credit(agents)
     phi = _check_phi(chosen, phi, (observation_size, action_size))
     env = EnvSpec(
@@ -129,8 +137,8 @@ def pure_credit(
         action_size=action_size,
         discrete=discrete,
         max_steps=max_steps,
-        low=np.broadcast_to(np.asarray(low, np.float32), (agents, action_size)),
-        high=np.broadcast_to(np.asarray(high, np.float32), (agents, action_size)),
+        low=_read_bounds("low", low, (agents, action_size)),
+        high=_read_bounds("high", high, (agents, action_size)),
         is_jax=True,
     )
     config = CreditConfig(
@@ -153,7 +161,9 @@ def pure_credit(
 
 
 def _check_phi(method: Method, phi: LatentFunction | None, sizes: tuple[int, int]) -> LatentFunction | None:
-    """Return the function, if the method reads it. Raises `LareError` if it does not fit, or is missing."""
+    """Return the function, or None if the method does not read it. Raises `LareError` if it does not fit, or is missing."""
+    if not isinstance(phi, LatentFunction | None):
+        raise LareError(f"phi must come from lare_rl.design or lare_rl.load_function, and is {short_repr(phi)}")
     if phi is not None and tuple(phi.sizes) != sizes:
         raise LareError(
             f"phi reads observations and actions of the sizes {phi.sizes[0]} and {phi.sizes[1]}, not {sizes[0]} and {sizes[1]}"
@@ -161,6 +171,15 @@ def _check_phi(method: Method, phi: LatentFunction | None, sizes: tuple[int, int
     if method.needs_phi and phi is None:
         raise LareError(f"{method.name} needs a latent function: phi=...")
     return phi if method.needs_phi else None
+
+
+def _read_bounds(name: str, bounds: Any, shape: tuple[int, int]) -> Float[np.ndarray, "agents action"]:
+    try:
+        return np.broadcast_to(np.asarray(bounds, np.float32), shape)
+    except (TypeError, ValueError):
+        raise LareError(
+            f"{name} = {short_repr(bounds)}: give a number, or numbers of the shape {shape[1:]} or {shape}"
+        ) from None
 
 
 def _check_steps(config: CreditConfig) -> None:
@@ -216,7 +235,7 @@ def _make_functions(config: CreditConfig, phi: tuple[Graph, ...]) -> PureCredit:
 def _valid_factors(
     phi: tuple[Graph, ...], steps: Trajectory, config: CreditConfig
 ) -> tuple[Float[Array, "time envs agents factors"], Bool[Array, "time envs agents"]]:
-    """Return the factors of steps, and for which steps of an agent all of them are finite. The others are 0."""
+    """Return the factors of steps, and for which steps of an agent they are finite. Where they are not, all factors are 0."""
     factors = compute_factors(phi, steps, config)
     is_valid = jnp.all(jnp.isfinite(factors), axis=-1)
     return jnp.where(is_valid[..., None], factors, 0), is_valid
@@ -226,17 +245,18 @@ def _trajectory(steps: CreditSteps, config: CreditConfig) -> Trajectory:
     """Return the steps with an axis of agents."""
     env, lead = config.env, jnp.shape(steps.terminated)
 
-    def with_agents(values: Array, *rest: int) -> Float[Array, "time envs agents *rest"]:
-        return jnp.asarray(values, jnp.float32).reshape(*lead, env.n_agents, *rest)
+    def read(name: str, *rest: int) -> Float[Array, "time envs agents *rest"]:
+        values, shape = jnp.asarray(getattr(steps, name), jnp.float32), (*lead, env.n_agents, *rest)
+        if values.size != math.prod(shape):
+            raise LareError(f"{name} has the shape {values.shape}, and should have {shape}")
+        return values.reshape(shape)
 
-    action = with_agents(steps.action, env.action_size)
+    action = read("action", env.action_size)
     empty = jax.tree.map(jnp.asarray, empty_batch(env, *lead))
-    timestep = empty._replace(
-        observation=with_agents(steps.observation, env.observation_size), alive=jnp.ones_like(empty.alive)
-    )
+    timestep = empty._replace(observation=read("observation", env.observation_size), alive=jnp.ones_like(empty.alive))
     next_timestep = timestep._replace(
-        observation=with_agents(steps.next_observation, env.observation_size),
-        reward=with_agents(steps.reward),
+        observation=read("next_observation", env.observation_size),
+        reward=read("reward"),
         terminated=jnp.asarray(steps.terminated, bool),
         truncated=jnp.asarray(steps.truncated, bool),
     )
@@ -245,7 +265,7 @@ def _trajectory(steps: CreditSteps, config: CreditConfig) -> Trajectory:
 
 
 def _stored_steps(learner: Learner, columns: dict[str, Any], next_columns: dict[str, Any]) -> StoredSteps:
-    """Return steps in the form of the replay's. Their episodes are as long as the finished ones on average."""
+    """Return steps as if the replay stored them, in episodes of the mean length of the finished ones."""
     lead = columns["reward"].shape[:2]
     zeros = jnp.zeros((*lead, 1))
     return StoredSteps(

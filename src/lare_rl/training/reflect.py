@@ -17,7 +17,7 @@ from lare_rl.credit.factor_fit import assess_factors
 from lare_rl.credit.input_names import raw_feature_names
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.play import Episode, Policy, play_episodes
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, check_count
 from lare_rl.latent.function import LatentFunction
 from lare_rl.latent.improve import Assessment, improve
 from lare_rl.llm.model import Model, ModelFunction, as_model
@@ -30,7 +30,6 @@ __all__ = ["FunctionAssessment", "assess_function", "reflect"]
 
 N_EPISODES = 40
 """The default number of episodes to play."""
-
 N_CORRELATED = 3
 """The number of other factors whose correlation with a factor is named."""
 
@@ -56,17 +55,15 @@ def reflect(
         task: the task of the function: a name, a path, or a spec.
         model: the language model, as for `lare_rl.design`.
         episodes: whole episodes, or a run whose stored episodes are used; by default, 40 are played.
-        policy: plays the episodes instead of random actions: a function from one observation of a single agent (and the mask of
-            available actions, if the environment has one) to one action.
+        policy: plays the episodes instead of random actions: a function from an observation of a single agent (and the mask of
+            available actions, if the environment has one) to an action.
         record: a file to record every exchange in; if the design was recorded, the same file.
 
     Raises:
         LareError: `rounds` is less than 1, `record` exists and does not hold the function's exchanges, or each team of the task has
             its own function.
     """
-    role, model = require_role(resolve_task(task)), as_model(model)
-    if rounds < 1:
-        raise LareError(f"rounds = {rounds}: at least one is needed")
+    role, model, rounds = require_role(resolve_task(task)), as_model(model), check_count("rounds", rounds)
 
     @cache
     def load_episodes() -> Sequence[Episode]:
@@ -95,7 +92,7 @@ class FunctionAssessment(NamedTuple):
     sentences: list[str]
     """Sentences for the user; empty if the returns are all the same."""
     ranges: list[str]
-    """A line on the values of each factor."""
+    """For each factor, a line on the range of its values and on its correlations."""
 
 
 def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence[Episode]) -> FunctionAssessment:
@@ -115,8 +112,8 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
     basis = Basis(len(names), inputs[0].shape[-1] - len(names), extended=True)
     alive, returns = [episode.alive for episode in episodes], np.array([episode.return_ for episode in episodes])
     fit = assess_factors(inputs, alive, returns, basis, role.score, _levels(episodes))
-    observed = select_states(role.scored_observation, "observation", "next_observation")
-    sizes = dict.fromkeys(observed, role.observation_size) | {"action": role.action_size}
+    observation_names = select_states(role.scored_observation, "observation", "next_observation")
+    sizes = dict.fromkeys(observation_names, role.observation_size) | {"action": role.action_size}
     raw_names = raw_feature_names(role.observation, role.action, sizes) if basis.n_raw_used else []
     valid_factors = np.concatenate([rows[mask] for rows, mask in zip(inputs, alive, strict=True)])[:, : len(names)]
     findings = explanation_findings(fit.explanation, fit.score_type, names, raw_names)

@@ -1,4 +1,4 @@
-"""The rewards that the algorithm is trained on, and how close they are to the true ones."""
+"""The rewards that the algorithm is trained on, and how close proxy rewards are to true ones."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,14 +20,7 @@ from lare_rl.nn.masks import masked_mean
 from lare_rl.training.decoder_inputs import alive_agents, step_batch
 from lare_rl.training.learner import Learner
 
-__all__ = [
-    "accuracy_metrics",
-    "assess",
-    "masked_correlation",
-    "mean_absolute_error",
-    "rewards",
-    "team_metrics",
-]
+__all__ = ["accuracy_metrics", "assess", "masked_correlation", "mean_absolute_error", "rewards", "team_metrics"]
 
 
 def rewards(
@@ -40,11 +33,11 @@ def rewards(
         if config.method.has_proxy_rewards:
             team_rewards.append(training_rewards(decoder, step_batch(steps, config, i), config.credit_specs[i]))
             continue
-        is_dense, team_alive = config.method.reward is Reward.TRUE, alive[..., team.agents]
-        reward = steps.columns["reward"][..., team.agents] if is_dense else steps.episodic_reward[..., i, None]
+        reward, team_alive = steps.episodic_reward[..., i, None], alive[..., team.agents]
+        if config.method.reward is Reward.TRUE:
+            reward = steps.columns["reward"][..., team.agents]
         reward = jnp.broadcast_to(reward, team_alive.shape)
-        scaled = scale_and_mask(reward, decoder.scale, team_alive, scale_rewards=config.scale_rewards)
-        team_rewards.append(scaled)
+        team_rewards.append(scale_and_mask(reward, decoder.scale, team_alive, scale_rewards=config.scale_rewards))
     return jnp.concatenate(team_rewards, axis=-1)
 
 

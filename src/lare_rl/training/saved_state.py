@@ -1,4 +1,4 @@
-"""The training state of a run's last checkpoint."""
+"""Loads the training state, or only the actor, of a run's last checkpoint."""
 
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -20,18 +20,18 @@ __all__ = ["SavedState", "load_actor", "load_learner"]
 
 
 class SavedState(NamedTuple):
-    """The training state of a checkpoint."""
+    """What a checkpoint holds, with the configuration of the run."""
 
     config: TrainConfig
     learner: Learner
     metadata: dict[str, Any]
-    """Other values, as JSON."""
+    """The other values of the session, which were saved as JSON (`Session.save`)."""
     arrays: dict[str, np.ndarray]
-    """Other arrays, by name."""
+    """The other arrays of the session, by name."""
 
 
 def load_learner(run: Run, n_devices: int = 1) -> SavedState:
-    """Load the last checkpoint of a run, with its seeds spread over devices.
+    """Load the last checkpoint of a run. Its configuration spreads the seeds over `n_devices` devices.
 
     Raises:
         LareError: there is no checkpoint, it is damaged, or it is of a version of LaRe whose state has another structure.

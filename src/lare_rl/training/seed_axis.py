@@ -20,7 +20,7 @@ State = TypeVar("State")
 
 @jax.jit
 def select_seed(state: State, seed_index: int | Int[Array, ""] = 0) -> State:
-    """Return the part of a training state that belongs to one seed."""
+    """Return one seed of a training state."""
     return jax.tree.map(lambda leaf: leaf[seed_index], state)
 
 

@@ -1,9 +1,8 @@
 """Algorithms that consume whole episodes: sample episodes, relabel them by the newest decoder, and update.
 
-There is one update for every `update_every` finished episodes. QMIX and VDN work like this. The team has one reward for
-each step: the mean over its agents that are alive. The mixer's input is the global state, standardised by its running
-mean and deviation (PyMARL2 does not standardise it, because its environments return scaled states). If there is no
-global state, the input is all observations side by side.
+QMIX and VDN work like this. There is one update for every `update_every` finished episodes. The team has one reward for each step: the
+mean over its agents that are alive. The mixer's input is the global state or, without one, all observations side by side. It is
+standardised by its running mean and deviation (PyMARL2 does not standardise it, because its environments return scaled states).
 """
 
 from functools import partial
@@ -36,8 +35,8 @@ Updated = tuple[Any, Decoders]
 """What an update changes: the `networks` of `SequenceState`, and the decoders."""
 
 MIN_STEPS_TO_SHORTEN = 32
-"""Batches may be shorter than the longest possible episode only if it has at least this many steps. The update is compiled
-once for each length, and a shorter batch of short episodes saves little time."""
+"""If the longest possible episode has fewer steps, batches have its length: the update is compiled once for each length, and a shorter
+batch of short episodes saves little time."""
 
 
 class SequenceState(NamedTuple):
@@ -48,12 +47,12 @@ class SequenceState(NamedTuple):
     mixer_statistics: RunningMeanStd
     """Running statistics of the mixer's input."""
     n_due: Int[Array, ""]
-    """The number of updates that were due so far: one for every `update_every` episodes. It includes updates that were not
-    made, because there were too few episodes for a batch."""
+    """The number of updates that were due so far: one for every `update_every` episodes, also if there were too few episodes for a
+    batch, and the update was not made."""
 
 
 class Actor(NamedTuple):
-    """The parts of the state that are needed to act."""
+    """What is needed to act: the agents' network, and the probability of a random action."""
 
     agent: Any
     epsilon: Float[Array, ""]
@@ -81,7 +80,7 @@ def init(key: PRNGKeyArray, config: TrainConfig) -> SequenceState:
 
 
 def get_actor(state: SequenceState, env_steps: int | Int[Array, ""], config: TrainConfig) -> Actor:
-    """Return the parts of the state that are needed to act, of one seed or of all."""
+    """Return the actor after `env_steps` environment steps, of one seed or of all."""
     algorithm = config.algorithm.load()
     epsilon = algorithm.epsilon(env_steps, _settings(config))
     # `n_due` has the shape (seeds,), or () for one seed.

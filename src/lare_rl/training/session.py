@@ -23,7 +23,6 @@ from lare_rl.runs import checkpoint
 from lare_rl.runs.best_policy import BEST_FILE, BestPolicy, empty_best, load_best, save_best, update_best
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import ACTOR_SATURATION, DETERMINISTIC_RETURN
-from lare_rl.training import decoder_fits
 from lare_rl.training.collect_device import DeviceCollector, is_reset_cheap, make_jax_env
 from lare_rl.training.collect_host import HostCollector, make_host_collector
 from lare_rl.training.compiled import (
@@ -35,8 +34,11 @@ from lare_rl.training.compiled import (
     init_seeds,
     is_batching_faster,
     learner_shape,
+    merge_metrics,
 )
+from lare_rl.training.decoder_fits import config_of_first_fit, fit_until_converged, has_enough_episodes
 from lare_rl.training.decoder_inputs import compute_host_factors
+from lare_rl.training.divergence import check_losses
 from lare_rl.training.evaluation import greedy_actions, metrics_lines, saturation
 from lare_rl.training.explain import compile_explanation
 from lare_rl.training.learner import Learner, abandon_episodes
@@ -44,7 +46,6 @@ from lare_rl.training.policy import actor_shape, get_actor
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import count_seed_devices
 from lare_rl.training.streams import Stream, seed_keys, stream_keys
-from lare_rl.training.unroll_host import DivergedError
 from lare_rl.util.float64 import load_linear_algebra, one_blas_thread
 from lare_rl.util.npz import DAMAGED_FILE_ERRORS
 
@@ -78,13 +79,13 @@ class Session:
     other."""
 
     _unchecked: tuple[Any, Trajectory] | None = None
-    """Whether all factors of the newest steps are finite, for each seed, and these steps."""
+    """The newest steps, after whether all their factors are finite, for each seed."""
     _threads: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(3))
     """Threads that write checkpoints, update while steps are collected, and compile."""
     _saving: Future[None] | None = None
     """The checkpoint that is being written."""
     _iteration_s: float = MAX_CALL_S
-    """How long an iteration of the last compiled call has taken. The first call thus makes a single iteration."""
+    """Seconds of an iteration in the last compiled call. By its initial value, the first call makes a single iteration."""
     _stop_requested: Callable[[], bool] = field(default=lambda: False)
     """Whether the user has asked the run to stop."""
 
@@ -94,15 +95,11 @@ class Session:
 
     @property
     def actor(self) -> Any:
-        """The parts of the learner that are needed to act now."""
+        """What is needed to act now, of all seeds."""
         return get_actor(self.learner.algorithm, self.step, self.config)
 
     def watch(self, on_step: Callable[[int], None], stop_requested: Callable[[], bool]) -> None:
-        """Call `on_step` with the number of steps of each seed while environments step on the host.
-
-        Args:
-            stop_requested: whether the user has asked the run to stop.
-        """
+        """Set what is called while environments step on the host, and what returns whether the user has asked the run to stop."""
         self._stop_requested = stop_requested
         if isinstance(self.collector, HostCollector):
             self.collector.watch(on_step, stop_requested)
@@ -118,7 +115,7 @@ class Session:
             self._iterate_compiled(self.loop, (until - self.step) // self.config.iteration_steps)
             return
         if self.settings.overlap_collection:
-            # The host collects by the policy from before the update. It needs a copy, because the update reuses the learner's memory.
+            # The policy from before the update collects. It is a copy, because the update reuses the learner's memory.
             actor, config = jax.tree.map(jnp.copy, self.actor), self.config
             # In a thread, because the call of an update returns when the device has nearly finished it. It reads only stored steps.
             no_steps = empty_trajectory(config.env, len(self.run.seeds), config.rollout_steps, config.n_envs)
@@ -161,20 +158,6 @@ class Session:
             self.learner = self.functions.learn_returns(self.learner)
         self._unchecked = is_finite, steps
 
-    def _check_losses(self) -> None:
-        """Raise `DivergedError` if a loss is not finite, so that no checkpoint has a diverged state."""
-        seeds, metrics = self.run.seeds, self.latest_metrics
-        updates = np.asarray(metrics.get("algorithm/updates", np.ones(len(seeds))))
-        for name in metrics:
-            if not name.startswith(("critic/loss", "credit/loss")):
-                continue
-            for seed, loss, n_updates in zip(seeds, np.asarray(metrics[name]), updates, strict=True):
-                if n_updates and not np.isfinite(loss):
-                    raise DivergedError(
-                        f"training diverged: {name} of seed {seed} is not finite at step {self.step}; the last checkpoint is "
-                        "whole: train again with a smaller learning rate (a JaxEnv may also have returned NaN)"
-                    )
-
     def _update(self, steps: Trajectory) -> None:
         """Make the decoders' own updates if they are due, and then update the algorithm. Do nothing during the warmup."""
         config, seeds = self.config, jnp.asarray(self.run.seeds)
@@ -184,18 +167,15 @@ class Session:
             self._fit(stream_keys(seeds, Stream.FIT, self.step))
         keys = seed_keys(seeds, self.step + 1)
         self.learner, metrics = self.functions.train_step(self.learner, steps, keys, self.step)
-        if "algorithm/updates" in metrics:  # the newest metrics of a seed are those of its last updates
-            is_new, old = metrics["algorithm/updates"] > 0, self.latest_metrics
-            metrics = {name: jnp.where(is_new, values, old.get(name, values)) for name, values in metrics.items()}
-            metrics = metrics if np.any(is_new) else {}
-        self.latest_metrics |= metrics
+        metrics, is_new = merge_metrics(self.latest_metrics, metrics)
+        if np.any(is_new):
+            self.latest_metrics = metrics
 
     def _fit(self, keys: Key[Array, " seeds"]) -> None:
         """Fit the decoders. The first fit lasts until it brings no improvement."""
-        if self._is_before_first_fit and decoder_fits.has_enough_episodes(self.learner):
-            fit = compile_functions(decoder_fits.config_of_first_fit(self.config)).fit
-            inputs = self.learner, fit, keys, self.config, self._stop_requested
-            self.learner, metrics = decoder_fits.fit_until_converged(*inputs)
+        if self._is_before_first_fit and has_enough_episodes(self.learner):
+            fit = compile_functions(config_of_first_fit(self.config)).fit
+            self.learner, metrics = fit_until_converged(self.learner, fit, keys, self.config, self._stop_requested)
             self.first_fit_done = True
         else:
             self.learner, metrics = self.functions.fit(self.learner, keys)
@@ -219,12 +199,12 @@ class Session:
     def _compile_while_collecting(self) -> None:
         """Compile in threads what the first finished episodes need. Until then, the processor often waits for a simulator.
 
-        An error is left to the call that needs the program: it compiles again.
+        Errors are ignored here: the call that needs the program compiles again.
         """
         shape = learner_shape(self.config, len(self.run.seeds))
         load_linear_algebra()
         self._threads.submit(self.functions.compile_learning, shape)
-        # A shorter run is rarely explained.
+        # A shorter run may have too few episodes to explain.
         is_explained = self.settings.steps >= MIN_EXPLAINED_EPISODES * self.config.env.max_steps
         if is_explained and self.config.n_devices == 1:
             self._threads.submit(compile_explanation, shape, self.config)
@@ -236,8 +216,7 @@ class Session:
             One line of metrics.jsonl for each seed.
 
         Raises:
-            DivergedError: a policy or a loss is not finite any more.
-            LareError: a factor is not finite, an environment fails, or the best policies cannot be written.
+            LareError: a policy, a loss or a factor is not finite, an environment fails, or the best policies cannot be written.
         """
         self._check_factors()
         actor, n_episodes = self.actor, self.settings.evaluation_episodes
@@ -247,14 +226,14 @@ class Session:
         metrics = evaluation.drop_group(self.run.config.task).metrics(self.config.env)
         metrics |= self.functions.assess(self.learner) | self.latest_metrics
         is_last, is_sampled = self.step == self.settings.steps, not self.config.deterministic_evaluation
-        # Only at the end, because it takes as long as the evaluation of sampled actions. Not in JAX, where it would be a program of its own
-        # to compile.
+        # Only at the end, because it takes as long as the evaluation of sampled actions. Not in JAX, where another program would have to be
+        # compiled.
         if is_last and is_sampled and isinstance(self.collector, HostCollector):
             deterministic = self.collector.evaluate(actor, n_episodes, deterministic=True)
             metrics[DETERMINISTIC_RETURN] = deterministic.returns[..., 0].mean(axis=1)
         if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
             metrics[ACTOR_SATURATION] = saturation(greedy_actions(actor, self.learner.replay, self.config))
-        self._check_losses()
+        check_losses(self.latest_metrics, self.run.seeds, self.step)
         return metrics_lines(self.run.seeds, self.step, metrics, rate)
 
     def _keep_best(self, score: Float[np.ndarray, " seeds"], actor: Any) -> None:
@@ -271,7 +250,7 @@ class Session:
             LareError: the last checkpoint could not be written, or a factor or a loss is not finite.
         """
         self._check_factors()
-        self._check_losses()
+        check_losses(self.latest_metrics, self.run.seeds, self.step)
         self.finish_saving()
         metadata = {
             "step": self.step,

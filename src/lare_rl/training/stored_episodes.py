@@ -36,10 +36,9 @@ def stored_episodes(run: Run | str | Path, seed: int | None = None) -> list[Log]
         rewards         [T]                      the true ones
         terminations    [T]                      TD3, DDPG and SAC: whether the episode ended by itself
         truncations     [T]                      TD3, DDPG and SAC: whether it reached its time limit
-
         group           a number                 if the task has groups
 
-    With many agents, the first three have an axis of agents after the axis of steps. Observations are flattened.
+    With several agents, the first three have an axis of agents after the axis of steps. Observations are flattened.
 
     Args:
         seed: one of the run's seeds; the first by default.
@@ -77,7 +76,7 @@ def stored_role_episodes(run: Run, role: TaskSpec) -> list[Episode]:
         _check_columns(run, replay, "state" if role.credit_scope == "state" else "observation", "action", "reward")
         for env_index in range(config.n_envs):
             newest = list(_finished_episodes(replay, env_index, n_newest))
-            # The last episodes of each environment were played at about the same time.
+            # The newest episodes of all environments ended at about the same time, so they are counted back from the newest.
             episodes += [
                 (i - len(newest), replace(_make_episode(columns, next_columns, config.env, role), group=level))
                 for i, (columns, next_columns, level) in enumerate(newest)

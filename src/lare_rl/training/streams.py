@@ -1,4 +1,4 @@
-"""Random numbers that are a function of seed, purpose and number, so that there is no state to save."""
+"""Random numbers that are a function of seed, purpose and the number of a step or episode, so that there is no state to save."""
 
 from collections.abc import Sequence
 from enum import IntEnum
@@ -24,7 +24,7 @@ __all__ = [
 
 
 class Stream(IntEnum):
-    """The purposes of random numbers. The numbers of each purpose are independent of the others."""
+    """The purposes of random numbers. The streams are independent of each other."""
 
     TRAINING_EPISODES = 0
     EXPLORATION = 1
@@ -45,12 +45,12 @@ def episode_seed(seed: int, stream: Stream, episode: int) -> int:
 
 @jax.jit
 def seed_keys(seeds: Int[Array, " seeds"], number: int | Array) -> Key[Array, " seeds"]:
-    """Return a key for each seed."""
+    """Return a key for each seed, by a number. The keys of purposes have negative numbers (`stream_keys`)."""
     return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), number))(seeds)
 
 
 def keys_shape(n_seeds: int) -> Any:
-    """Return the keys of all seeds with a shape instead of an array."""
+    """Return keys of all seeds, with a shape instead of an array."""
     return jax.eval_shape(seed_keys, jnp.zeros(n_seeds, int), 0)
 
 

@@ -6,6 +6,7 @@ The service's own settings decide where it stores them, and whether it is reache
 `MLFLOW_TRACKING_URI`). A resumed run continues in new runs of the service, from the step of its checkpoint.
 """
 
+import inspect
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -23,18 +24,22 @@ class WeightsAndBiases(Listener):
         """Take the arguments of `wandb.init`: project, group, config, mode, dir, ...
 
         Raises:
-            LareError: wandb is not installed.
+            LareError: wandb is not installed, or `wandb.init` has no such argument.
         """
         try:
             import wandb
+
+            inspect.signature(wandb.init).bind(reinit="create_new", **arguments)
         except ImportError:
             raise missing_extra_error("Weights & Biases", "wandb") from None
+        except TypeError as error:
+            raise LareError(f"wandb.init cannot be called with these arguments: {error}") from None
         self.init, self.arguments, self.name = wandb.init, arguments, ""
         self.runs: dict[int, Any] = {}
         """The service's runs, by seed."""
 
     def on_start(self, name: str, step: int, steps: int) -> None:
-        self.name = name
+        self.name, self.runs = name, {}  # the listener may have been used before
 
     def on_evaluation(self, metrics: MetricLines) -> None:
         for line in metrics:
@@ -83,7 +88,7 @@ class MLflow(Listener):
         """The ids of the service's runs, by seed."""
 
     def on_start(self, name: str, step: int, steps: int) -> None:
-        self.name = name
+        self.name, self.runs = name, {}  # the listener may have been used before
 
     def on_evaluation(self, metrics: MetricLines) -> None:
         now_ms = int(1000 * time.time())

@@ -35,11 +35,11 @@ from lare_rl.util.findings import Finding, render
 __all__ = ["RunInterruptedError", "resume", "run_session", "train"]
 
 EVENTS_DIRECTORY = "tensorboard"
-"""Within the run directory."""
+"""The folder of TensorBoard events in a run's directory."""
 CHECKPOINT_S = 300.0
-"""Seconds after which a checkpoint is written between two evaluations: what a crash may cost."""
+"""Between two evaluations, a checkpoint is written after so many seconds. A crash costs about as much."""
 PROGRESS_S = 1.0
-"""Listeners hear of steps inside an iteration at most this often (s)."""
+"""The least time (s) between two calls of `on_step` inside an iteration."""
 
 
 class RunInterruptedError(LareError):
@@ -156,14 +156,17 @@ def _finish(
     messages: Sequence[str],
     earlier_steps: int,
 ) -> Run:
-    """Run to the end, from the last checkpoint if there is one. Every listener that was started is stopped, also after an error."""
+    """Run to the end, from the last checkpoint if there is one. Every listener that was started is stopped, also after an error.
+
+    `messages` are sent to the listeners first. A run that is extended had `earlier_steps` before.
+    """
     for listener in listeners:
         listener.on_message(
             f"preparing {run.directory}: compiling takes about half a minute, or about ten seconds if it was done before"
         )
     compilation.enable_cache()
     is_new = not run.has_checkpoint()
-    session, restored = (start_session(run), []) if is_new else restore_session(run)
+    session, restore_messages = (start_session(run), []) if is_new else restore_session(run)
     with contextlib.ExitStack() as opened:
         opened.callback(session.close)
         if is_new:
@@ -172,18 +175,19 @@ def _finish(
             truncate_metrics(run.directory, session.metrics_bytes)
         if tensorboard:
             listeners = [*listeners, TensorBoard(run.directory / EVENTS_DIRECTORY, session.step, run.seeds)]
+        messages = [*messages, *restore_messages, *_introduction(session, earlier_steps)]
+        name = f"{run.config.task.name} {session.settings.method}"
         for listener in listeners:
             opened.callback(listener.on_stop)
-            for message in (*messages, *restored, *_introduction(session, earlier_steps)):
+            for message in messages:
                 listener.on_message(message)
-            name = f"{run.config.task.name} {session.settings.method}"
             listener.on_start(name, session.step, session.settings.steps)
         run_session(session, listeners, stop)
     return run
 
 
 def _introduction(session: Session, earlier_steps: int) -> list[str]:
-    """Return messages about a session before its next step. A run that is extended had `earlier_steps` before."""
+    """Return what the user should know of a session before its next step."""
     settings, step, messages = session.settings, session.step, []
     if step and settings.steps > earlier_steps and getattr(settings.hyperparameters, "anneal", False):
         messages.append(
@@ -194,7 +198,8 @@ def _introduction(session: Session, earlier_steps: int) -> list[str]:
     warning = warmup_warning(settings)
     if warning is None and step < settings.warmup:
         warning = f"the first {settings.warmup:,} steps are random ({settings.algorithm}.warmup): the policy is not trained yet"
-    messages += [] if warning is None else [warning]
+    if warning is not None:
+        messages.append(warning)
     if step >= settings.steps:
         messages.append(
             f"the run is complete ({settings.steps:,} steps): to continue it, give a larger --steps (steps=... in Python)"
@@ -210,9 +215,8 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
         DivergedError: a policy or a loss is not finite any more.
     """
     run, settings = session.run, session.settings
-    hint = f"to continue: lare-rl train --resume {shlex.quote(str(run.directory))}"
-    explained, saved_at = False, time.monotonic()
-    rated_step, rated_at = session.step, saved_at
+    is_explained, saved_at = False, time.monotonic()
+    rated_step, rated_at = session.step, saved_at  # when the last rate was measured
     returns: list[np.ndarray] = []
     evaluated_at: list[float] = []
     session.watch(_limit_rate(lambda step: [listener.on_step(step) for listener in listeners]), stop.is_set)
@@ -228,16 +232,7 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
     report(advice.find_unwritten_texts(run.config.task) if session.step == 0 else [])
     while session.step < settings.steps:
         before = session.step
-        if stop.is_set():
-            session.save()
-            session.finish_saving()
-            raise RunInterruptedError(f"stopped at step {before} of {settings.steps} and saved; {hint}")
-        try:
-            session.advance(min(settings.steps, (before // settings.evaluate_every + 1) * settings.evaluate_every))
-        except FirstFitStoppedError:
-            raise RunInterruptedError(
-                f"stopped during the decoder's first fit: nothing is kept of it; {hint}"
-            ) from None
+        _advance(session, stop)
         for listener in listeners:
             listener.on_step(session.step)
         if before <= settings.warmup < session.step:
@@ -260,21 +255,35 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
         for listener in listeners:
             listener.on_evaluation(lines)
         if any(map(was_updated, lines)):
-            returns.append(np.array([line[RETURN] for line in lines]))
+            returns.append(np.array([line[RETURN] for line in lines], float))
             report(advice.find_constant_returns(returns))
         if len(evaluated_at) == 2:  # the first one compiles the policy
             report(advice.find_slow_evaluations(settings, evaluation_s, saved_at - evaluated_at[0]))
-        if session.step >= settings.warmup and (is_last or not explained):
-            sentences = describe_returns(run, session.learner, session.config, legend=not explained)
+        if session.step >= settings.warmup and (is_last or not is_explained):
+            sentences = describe_returns(run, session.learner, session.config, legend=not is_explained)
             report([Finding("provisional")] if sentences and not is_last else [])
             say(sentences)
-            explained = bool(sentences)
+            is_explained = bool(sentences)
         if is_last:
             report(_final_findings(run, lines))
 
 
+def _advance(session: Session, stop: threading.Event) -> None:
+    """Advance a session, at most to its next evaluation. Raise `RunInterruptedError` if `stop` is set."""
+    step, settings = session.step, session.settings
+    hint = f"to continue: lare-rl train --resume {shlex.quote(str(session.run.directory))}"
+    if stop.is_set():
+        session.save()
+        session.finish_saving()
+        raise RunInterruptedError(f"stopped at step {step} of {settings.steps} and saved; {hint}")
+    try:
+        session.advance(min(settings.steps, (step // settings.evaluate_every + 1) * settings.evaluate_every))
+    except FirstFitStoppedError:
+        raise RunInterruptedError(f"stopped during the decoder's first fit: nothing is kept of it; {hint}") from None
+
+
 def _limit_rate(call: Callable[[int], object]) -> Callable[[int], None]:
-    """Return a function that passes on at most one call in `PROGRESS_S`."""
+    """Return a function that passes on at most one call in `PROGRESS_S` seconds."""
     called_at = time.monotonic()
 
     def call_rarely(step: int) -> None:

@@ -13,15 +13,13 @@ from lare_rl.envs.env_errors import EnvOutputError, name_step
 from lare_rl.envs.interface import Timestep, team_mean, to_env_action
 from lare_rl.envs.play import EpisodeListener
 from lare_rl.envs.vec_env import VecEnv
-from lare_rl.errors import LareError
-from lare_rl.training.evaluation import EpisodeBatch, Evaluation, concatenate
+from lare_rl.training.divergence import check_actions
+from lare_rl.training.evaluation import EpisodeBatch, Evaluation
 from lare_rl.training.policy import draw_noise, init_host_memory, make_host_policy
 from lare_rl.training.streams import Stream, episode_seed, numpy_generator
 
 __all__ = [
-    "DivergedError",
     "add_seed_axis",
-    "check_actions",
     "evaluate_on_host",
     "evaluate_policy_on_host",
     "evaluation_policy",
@@ -34,23 +32,19 @@ BatchPolicy = Callable[[Timestep, Bool[np.ndarray, "seeds envs"]], Float[np.ndar
 """From a timestep, and which episodes have just begun, to the action."""
 
 
-class DivergedError(LareError):
-    """The policy is not finite any more."""
-
-
 def unroll_on_host(
     envs: VecEnv, policy: BatchPolicy, seeds: Sequence[int], episode_seeds: Sequence[int]
 ) -> Iterator[tuple[Trajectory, Bool[np.ndarray, "seeds episodes"]]]:
     """Play one episode in each environment, all in lockstep.
 
-    The environments of the first seed come first, then those of the second, and so on, and so do their `episode_seeds`. If there are
+    The environments of the first seed come first, then those of the second, and so on; the same is true of `episode_seeds`. If there are
     fewer episodes than environments, the last environments of each seed play none.
 
     Yields:
-        The next step of each environment, without the axis of time, and whether its episode had not ended before. The next
-        step overwrites `next_timestep`.
+        The next step of each environment, without the axis of time, and whether its episode had not ended before. The step
+        after it overwrites `next_timestep`.
     """
-    shape = len(seeds), len(envs.batch.terminated) // len(seeds)
+    shape = _batch_shape(envs, seeds)
     env_seeds, running = np.zeros(shape, np.int64), np.zeros(shape, bool)
     n_playing = len(episode_seeds) // len(seeds)
     running[:, :n_playing], env_seeds[:, :n_playing] = True, np.reshape(episode_seeds, (len(seeds), n_playing))
@@ -70,6 +64,11 @@ def unroll_on_host(
         steps = Trajectory(timestep=timestep, action=action, env_action=env_action, next_timestep=next_timestep)
         yield steps, running
         running, episode_start = running & ~steps.ended, np.zeros(shape, bool)
+
+
+def _batch_shape(envs: VecEnv, seeds: Sequence[int]) -> tuple[int, int]:
+    """Return the number of seeds, and of the environments of each."""
+    return len(seeds), len(envs.batch.terminated) // len(seeds)
 
 
 def record_on_host(
@@ -96,9 +95,8 @@ def evaluate_on_host(
     """
     numbers = range(first, first + n_episodes)
     episode_seeds = [episode_seed(seed, Stream.EVALUATION_EPISODES, number) for seed in seeds for number in numbers]
-    spec, width = envs.spec, len(envs.batch.terminated) // len(seeds)
-    shape = len(seeds), width
-    returns, summed_returns = np.zeros((*shape, len(spec.teams))), np.zeros((*shape, len(spec.teams)))
+    spec, shape = envs.spec, _batch_shape(envs, seeds)
+    returns, summed_returns = np.zeros((2, *shape, len(spec.teams)))
     lengths = np.zeros(shape, int)
     measures = {name: np.full(shape, np.nan) for name in spec.measures}
     try:
@@ -113,7 +111,7 @@ def evaluate_on_host(
             for name, values in measures.items():
                 values[ended] = next_timestep.measures[name][ended]
     except EnvOutputError as error:
-        where = "" if error.env_index is None else f", in an evaluation of seed {seeds[error.env_index // width]}"
+        where = "" if error.env_index is None else f", in an evaluation of seed {seeds[error.env_index // shape[1]]}"
         raise EnvOutputError(f"{error}{where}") from None
     results = Evaluation(returns, summed_returns, lengths, measures)
     return jax.tree.map(lambda values: values[:, :n_episodes], results)
@@ -122,9 +120,9 @@ def evaluate_on_host(
 def evaluation_policy(
     config: TrainConfig, actor: Any, seeds: Sequence[int], noise_rows: Int[np.ndarray, " episodes"], n_noise_rows: int
 ) -> BatchPolicy:
-    """Return the policy of all seeds for whole episodes, which all begin with its first call. It holds the memory of the actors.
+    """Return a policy of all seeds that has the actors' memory, for episodes that all begin with its first call.
 
-    The noise of these episodes is `noise_rows` of that of `n_noise_rows` episodes.
+    Noise is drawn for `n_noise_rows` episodes of each seed. These episodes use the `noise_rows` of it.
     """
     deterministic, n_episodes = config.deterministic_evaluation, len(noise_rows)
     policy = make_host_policy(config, actor, n_episodes, deterministic=deterministic)
@@ -145,9 +143,9 @@ def policy_turns(
 ) -> Iterator[tuple[range, BatchPolicy]]:
     """Yield the numbers of the episodes that begin together, and their policy, until each seed has `n_episodes`.
 
-    If there are fewer environments, some episodes begin after others. The noise of an episode does not depend on that.
+    If a seed has fewer environments, its episodes take turns. The noise of an episode does not depend on that.
     """
-    width = len(envs.batch.terminated) // len(seeds)
+    _, width = _batch_shape(envs, seeds)
     for start in range(0, n_episodes, width):
         rows = np.minimum(np.arange(start, start + width), n_episodes - 1)
         yield range(start, min(start + width, n_episodes)), evaluation_policy(config, actor, seeds, rows, n_episodes)
@@ -166,29 +164,19 @@ def evaluate_policy_on_host(
     """Evaluate `n_episodes` of each seed's policy. An episode does not depend on the number of environments.
 
     Args:
-        envs: as many environments for each seed.
-        actor: what acts, of all seeds.
+        envs: equally many environments for each seed.
+        actor: the actor of all seeds.
         first: the number of the first episode, which determines its initial state.
         on_step: called after each step of the environments.
-        on_episode: called with the number of episodes of each seed, when some have ended.
+        on_episode: called with the number of episodes that each seed has finished, after each turn.
     """
     evaluations = []
     for numbers, policy in policy_turns(envs, config, actor, seeds, n_episodes):
         evaluations.append(evaluate_on_host(envs, policy, seeds, len(numbers), first + numbers.start, on_step))
         on_episode(numbers.stop)
-    return concatenate(evaluations)
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays, axis=1), *evaluations)
 
 
 def add_seed_axis(timestep: Timestep, shape: tuple[int, int]) -> Timestep:
     """Return views of the same arrays, by seeds and environments."""
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), timestep)
-
-
-def check_actions(action: Float[np.ndarray, "seeds *rest"], seeds: Sequence[int]) -> None:
-    """Raise `DivergedError` if the actions of a seed's policy are not finite."""
-    for seed, action_of_seed in zip(seeds, action, strict=True):
-        if not np.isfinite(action_of_seed).all():
-            raise DivergedError(
-                f"training diverged: the policy of seed {seed} is not finite any more; the last checkpoint is whole: train again "
-                "with a smaller learning rate"
-            )
