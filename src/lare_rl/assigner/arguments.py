@@ -176,7 +176,6 @@ def to_env_id(value: Any) -> Hashable:
 def _to_team_reward(
     config: AssignerConfig, reward: Any, alive: Bool[np.ndarray, "rows agents"] | None, n_rows: int
 ) -> Float[np.ndarray, " rows"]:
-    """Return the team's reward of each row."""
     rewards = to_array(reward, "reward").astype(np.float64)
     if config.agents == 1:
         return _check_shape(rewards, "reward", "number", n_rows)

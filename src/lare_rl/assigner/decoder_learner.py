@@ -70,7 +70,6 @@ class DecoderLearner:
 
     @property
     def is_fitted(self) -> bool:
-        """Whether the decoder has been fitted yet."""
         if not self._is_fitted and self.config.method.fit is not None:  # cached, because reading the flag waits for JAX
             uses_gradient = self.config.method.uses_gradient
             self._is_fitted = self.n_updates > 0 if uses_gradient else bool(learning.is_fitted(self.decoder))
