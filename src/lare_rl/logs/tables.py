@@ -145,7 +145,7 @@ def _first_difference(expected: pa.Schema, actual: pa.Schema) -> str:
     columns = itertools.zip_longest(
         *(schema.remove_metadata().to_string().splitlines() for schema in (expected, actual))
     )
-    return next((right or left for left, right in columns if left != right), "a column")
+    return next((new or old for old, new in columns if old != new), "a column")
 
 
 def _rows_are_episodes(schema: pa.Schema) -> bool:
