@@ -206,7 +206,7 @@ def relabel(
 def hold_out_flags(share: float, seed: int) -> Iterator[bool]:
     """Yield without end whether the next complete episode is held out.
 
-    After each block of `BLOCK_EPISODES` episodes, `share` of all so far are held out, rounded down. Which episodes of a block these are is random.
+    After each block of `BLOCK_EPISODES` episodes, `share` of all so far are held out, rounded down. Those of a block are random.
     """
     block = 0
     while True:
