@@ -268,7 +268,6 @@ def test_old_output_is_kept(tmp_path):
         (None, {"hold_out": 1.0}, "hold_out = 1.0"),
         (None, {"memory": 0.0}, "memory = 0.0"),
         (None, {"updates": 0}, "updates = 0"),
-        (None, {"updates": 2.5}, "updates = 2.5"),
         ([episode | {"cut": True} for episode in logged_episodes(3)], {}, "none of 3 episodes"),
         ([], {}, "no episode"),
         ([7], {}, "episode 0 must be a mapping"),

@@ -68,8 +68,15 @@ class StepRecorder:
             kind = name.removeprefix("next_")
             if not self._same_space[kind]:
                 steps[name] = self.layouts[kind].rows(value, name)
-        results, group = (reward, terminated, truncated), self.read_groups(infos)
-        return self.credit.add(*steps.values(), *results, env_ids=self.env_ids, valid=valid, group=group)
+        return self.credit.add(
+            **steps,
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            env_ids=self.env_ids,
+            valid=valid,
+            group=self.read_groups(infos),
+        )
 
     def proxy_rewards(self, steps: Int[np.ndarray, " environments"]) -> Float[np.ndarray, "environments *agents"]:
         """Return r_hat of these steps, after pending updates of the decoder."""
