@@ -113,6 +113,8 @@ CALLS = {
     "lare_rl.CreditAssigner('lare-bayes', 7, task=task)": "lare_rl.load_function",
     "lare_rl.CreditAssigner('lare-bayes', phi, task=7)": "TaskSpec",
     "lare_rl.CreditAssigner('lare-bayes', phi, task=pick_spec())": "task='Pick'",
+    "credit.fit(2.5)": "updates = 2.5",
+    "lare_rl.relabel('none', 'out', updates=2.5)": "updates = 2.5",
     "lare_rl.relabel('none', 'out', task=7)": "TaskSpec",
     "lare_rl.logged_steps('none', 7)": "TaskSpec",
     "Method('mine', '', '', inputs=('observation',))": "method mine: ('observation',) is no InputNames: write",

@@ -401,6 +401,7 @@ NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
         ("rd", None, {"task": TASK, "observation_space": 3}, "observation_space .*3 .*observation_size = 2"),
         ("rd", None, {"capacity": 0}, "capacity = 0"),
         ("rd", None, {"capacity": 10**20}, "capacity = 1000"),
+        ("ircr", None, {"capacity": 10**15}, "capacity = 1000"),  # whose steps have no inputs
         ("rd", None, {"agents": 2, "max_steps": -3}, "max_steps = -3"),
         ("rd", None, {"fits_per_step": float("nan")}, "fits_per_step = nan"),
         ("rd", "factors", {}, "no phi"),

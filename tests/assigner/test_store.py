@@ -10,6 +10,8 @@ from lare_rl.errors import LareError
 from lare_rl.tasks.payments import PaymentRule
 
 MOVES = st.lists(st.tuples(st.sampled_from(["add", "add", "add", "end", "drop"]), st.integers(0, 2)), max_size=60)
+NOT_ENDED = np.zeros(1, bool), np.zeros(1, int)
+"""`ended` and `level` of one step."""
 
 
 @settings(max_examples=100, deadline=None)
@@ -81,7 +83,7 @@ def test_lengths_of_a_long_running_episode_is_its_steps_since_the_last_payment()
     store, row = Store(9, (1,), payments=PaymentRule(nonzero=True)), [np.zeros((1, 1), np.float32)] * 3
     for i in range(12):
         env_id = "b" if i in {5, 11} else "a"
-        list(store.extend([env_id], store.add(1), row, np.array([float(i == 1)]), np.zeros(1, bool)))
+        list(store.extend([env_id], store.add(1), row, np.array([float(i == 1)]), *NOT_ENDED))
     assert store.mean_length == 2
     assert store.lengths(store.rows(np.arange(3, 12))).tolist() == [8, 8, 2, 8, 8, 8, 8, 8, 2]
     store.drop("a")
@@ -91,7 +93,9 @@ def test_lengths_of_a_long_running_episode_is_its_steps_since_the_last_payment()
 def test_lengths_with_a_window_are_the_steps_that_payments_are_for():
     """T is the number of steps that a payment is for, also at steps that no payment has followed yet."""
     store, row = Store(20, (1,), payments=PaymentRule(period=2, window=5)), np.zeros((11, 1), np.float32)
-    payments = list(store.extend(["a"] * 11, store.add(11), [row] * 3, np.ones(11), np.zeros(11, bool)))
+    payments = list(
+        store.extend(["a"] * 11, store.add(11), [row] * 3, np.ones(11), np.zeros(11, bool), np.zeros(11, int))
+    )
     assert [len(payment.step_ids) for payment in payments] == [2, 4, 5, 5, 5]
     assert store.lengths(np.arange(11)).tolist() == [2, 2, 4, 4, *[5] * 7]
     assert store.mean_length == 21 // 5
@@ -111,7 +115,7 @@ def test_payments_are_stored_as_episodes(rule, steps, scores):
     reward, rows = np.arange(1.0, 6), np.zeros((5, 1), np.float32)
     step_by_step, at_once = Store(9, (1,), payments=rule), Store(9, (1,), payments=rule)
     numbers = step_by_step.add(5)
-    stored = list(step_by_step.extend(["a"] * 5, numbers, [rows] * 3, reward, np.arange(5) == 4))
+    stored = list(step_by_step.extend(["a"] * 5, numbers, [rows] * 3, reward, np.arange(5) == 4, np.zeros(5, int)))
     assert [episode.step_ids.tolist() for episode in stored] == steps
     assert [episode.return_ for episode in stored] == scores
     assert not step_by_step.running
@@ -123,8 +127,9 @@ def test_payments_are_stored_as_episodes(rule, steps, scores):
 def test_extend_raises_the_first_refusal():
     """The other episodes of the call are stored."""
     store, rows = Store(9, (1,), longest=1), [np.zeros((6, 1), np.float32)] * 3
+    ended, level = np.array([0, 0, 1, 0, 1, 1], bool), np.zeros(6, int)
     with pytest.raises(LareError, match="this one is for 2:"):
-        list(store.extend("abbaac", store.add(6), rows, np.ones(6), np.array([0, 0, 1, 0, 1, 1], bool)))
+        list(store.extend("abbaac", store.add(6), rows, np.ones(6), ended, level))
     assert (store.n_ended, store.dropped, store.running) == (1, 2, {})
     store = Store(9, (1,), longest=3)
     with pytest.raises(LareError, match="this one is for 4:"):
@@ -137,7 +142,7 @@ def test_late_payment_leaves_steps_of_other_environments():
     store, row = Store(10, (1,), payments=PaymentRule(nonzero=True, window=3)), [np.zeros((1, 1), np.float32)] * 3
     for i in range(21):
         env_id, reward = "b" if 9 <= i < 12 else "a", {11: 200.0, 20: 9.0}.get(i, 0.0)
-        list(store.extend([env_id], store.add(1), row, np.array([reward]), np.zeros(1, bool)))
+        list(store.extend([env_id], store.add(1), row, np.array([reward]), *NOT_ENDED))
     rows = store.rows(np.arange(11, 21))
     assert store.episode[rows].tolist() == [0] + 9 * [1]
     np.testing.assert_allclose(store.mean_reward[rows], [200 / 3] + 9 * [3], rtol=1e-6)
@@ -145,6 +150,6 @@ def test_late_payment_leaves_steps_of_other_environments():
 
 def test_end_needs_steps_that_are_not_paid():
     store, rows = Store(9, (1,), payments=PaymentRule(period=2)), np.zeros((2, 1), np.float32)
-    list(store.extend(["a"] * 2, store.add(2), [rows] * 3, np.ones(2), np.zeros(2, bool)))
+    list(store.extend(["a"] * 2, store.add(2), [rows] * 3, np.ones(2), np.zeros(2, bool), np.zeros(2, int)))
     with pytest.raises(LareError, match="'a' was paid already"):
         store.end("a", 1.0)

@@ -25,6 +25,7 @@ def test_path_is_not_a_log(tmp_path, monkeypatch):
         (tmp_path / ("long" * 100), "File name too long"),
         ("nologs", install_command("minari")),
         (7, "7 is not a log"),
+        (np.array(7), "array(7) is not a log"),
     ):
         with pytest.raises(LareError) as error:
             open_log(source)

@@ -1,4 +1,4 @@
-"""The arrays that a `CreditAssigner` is given: they are checked, and become rows of numbers."""
+"""The arguments of a `CreditAssigner`: they are checked, and become rows of numbers."""
 
 import contextlib
 from collections.abc import Hashable
@@ -61,7 +61,10 @@ def read_steps(
     `arrays` are the steps as `to_rows` returns them.
     """
     n_rows = len(arrays[0])
-    alive = _to_alive(config, alive, n_rows)
+    if alive is not None:
+        if config.agents == 1:
+            raise LareError("this assigner has a single agent: leave alive out")
+        alive = to_flags(alive, "alive", n_rows, config.agents)
     team_reward = _to_team_reward(config, reward, alive, n_rows)
     ended = to_flags(terminated, "terminated", n_rows) | to_flags(truncated, "truncated", n_rows)
     rows = np.flatnonzero(np.ones(n_rows, bool) if valid is None else to_flags(valid, "valid", n_rows))
@@ -125,10 +128,9 @@ def to_rows(
 def to_levels(
     config: AssignerConfig, group: Any, new: NewSteps, group_names: dict[GroupName, int]
 ) -> Int[np.ndarray, " steps"]:
-    """Return the number of the group of each new step, and add new groups to `group_names`. It is -1 for None.
+    """Return the number of each new step's group, -1 for None, and add new groups to `group_names`.
 
-    Raises `LareError` if there are too many groups, if they do not fit, or if a step that is paid has none. `group_names` is then
-    unchanged.
+    Raises `LareError` if there are too many groups, if they do not fit, or if a step that is paid has none; it then adds none.
     """
     if config.groups and group is None:
         raise LareError("this assigner needs groups: give group=, or set groups=False, if your adapter has none")
@@ -152,7 +154,7 @@ def to_levels(
 
 
 def _to_list(values: Any, name: str, n_rows: int) -> list[Any]:
-    """Return a list with a value for each row. Raises `LareError` if there are more or fewer, or if `values` is no list."""
+    """Return a list with a value for each row. Raises `LareError` for more or fewer values, or if `values` is no list."""
     if isinstance(values, str) or not np.iterable(values):
         raise LareError(f"{name} is {short_repr(values)}: give a list, with an entry for each row")
     entries = list(values)
@@ -165,24 +167,15 @@ def to_env_id(value: Any) -> Hashable:
     """Return an environment as a key of a dictionary. Raises `LareError` if it cannot be found again by its value."""
     env_id = value.tolist() if hasattr(value, "tolist") else value  # the hash of a tensor is its identity
     with contextlib.suppress(TypeError):
-        if hash(env_id) is not None and env_id == env_id:  # NaN
+        hash(env_id)
+        if env_id == env_id:  # false for NaN
             return env_id
     raise LareError(f"an env_id must be a text, a number or another hashable value, and is {short_repr(value)}")
-
-
-def _to_alive(config: AssignerConfig, alive: Any, n_rows: int) -> Bool[np.ndarray, "rows agents"] | None:
-    """Return which agents were alive. None means all."""
-    if alive is None:
-        return None
-    if config.agents == 1:
-        raise LareError("this assigner has a single agent: leave alive out")
-    return to_flags(alive, "alive", n_rows, config.agents)
 
 
 def _to_team_reward(
     config: AssignerConfig, reward: Any, alive: Bool[np.ndarray, "rows agents"] | None, n_rows: int
 ) -> Float[np.ndarray, " rows"]:
-    """Return the team's reward of each row."""
     rewards = to_array(reward, "reward").astype(np.float64)
     if config.agents == 1:
         return _check_shape(rewards, "reward", "number", n_rows)
@@ -207,7 +200,7 @@ def to_flags(values: Any, name: str, *shape: int) -> Bool[np.ndarray, "*shape"]:
 
 
 def to_lengths(values: Any, n_rows: int) -> Int[np.ndarray, " rows"]:
-    """Return the length of each row's episode. Raises `LareError` if there are more or fewer, or one is no positive whole number."""
+    """Return the length of each row's episode. Raises `LareError` for more or fewer, or if one is no positive whole number."""
     lengths = _check_shape(to_array(values, "length").astype(np.float64), "length", "number", n_rows)
     wrong = np.flatnonzero(~((lengths >= 1) & (lengths < 2**31)) | (lengths != np.floor(lengths)))
     if len(wrong):

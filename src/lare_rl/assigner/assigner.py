@@ -12,6 +12,7 @@ samples steps, because stored proxy rewards would be those of an older decoder.
 
 import threading
 from collections.abc import Hashable, Iterable
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from lare_rl.assigner.step_rewards import StepRewards
 from lare_rl.assigner.store import Store
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import Reward
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.function import LatentFunction
 from lare_rl.tasks.payments import PaymentRule
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
@@ -66,8 +67,8 @@ class CreditAssigner:
             method: the name of a method; the default is `lare-bayes` with a `phi`, and `bayes` without. `dense` and `episodic` assign
                 no credit.
             phi: for the methods that need one: those whose names begin with `lare-`, and `llm-reward`.
-            task: the task that `phi` was designed for: a name, a path, or a spec. It decides spaces and
-                `scored_observation` if you do not give them.
+            task: the task that `phi` was designed for: a name, a path, or a spec. It decides spaces and `scored_observation` if you do
+                not give them.
             observation_space: the space of a single agent in a single environment, or the length of an observation.
             action_space: the same for actions. Actions are in the environment's units.
             scored_observation: the observations of a step that factors and raw features are computed from: "before", "after" or
@@ -113,10 +114,13 @@ class CreditAssigner:
     def _init(self, config: AssignerConfig) -> None:
         check_config(config)
         self.config = config
-        row_shape = (*config.agent_axis, config.spec.basis.n_inputs)
-        longest = config.method.decoder_kind.longest_segment
         self.store = Store(
-            config.capacity, row_shape, config.agents, config.payments, has_levels=config.groups, longest=longest
+            config.capacity,
+            (*config.agent_axis, config.spec.basis.n_inputs),
+            config.agents,
+            config.payments,
+            has_levels=config.groups,
+            longest=config.method.decoder_kind.longest_segment,
         )
         self.group_names: dict[GroupName, int] = {}
         """The number of each group."""
@@ -168,9 +172,8 @@ class CreditAssigner:
         with self.lock:
             if env_ids is not None and lanes is not None:
                 raise LareError("both env_ids and lanes, its earlier name, were given: leave lanes out")
-            steps = observation, action, next_observation
             ids = lanes if env_ids is None else env_ids
-            arrays = arguments.to_rows(self.config, *steps)
+            arrays = arguments.to_rows(self.config, observation, action, next_observation)
             new = arguments.read_steps(self.config, arrays, reward, terminated, truncated, ids, valid, alive)
             step_ids = np.full(new.n_rows, -1)
             if len(new.rows):
@@ -224,9 +227,11 @@ class CreditAssigner:
 
     def fit(self, updates: int = 500) -> None:
         """Fit now, by this many gradient updates of the decoder. A closed-form decoder is fitted once, whatever `updates` is."""
+        if not isinstance(updates, Integral):
+            raise LareError(f"updates = {short_repr(updates)}: give a whole number")
         with self.lock:
             self.learner.learn_returns()
-            self.learner.fit(updates)
+            self.learner.fit(int(updates))
 
     def fit_pending(self) -> None:
         """Make the gradient updates for the steps that were added since the last call, once there are at least 16 updates.
@@ -277,7 +282,7 @@ class CreditAssigner:
                 if begins is None:
                     raise LareError(f"{method.name} reads the history of an episode: give begins, or call rewards_at")
                 inputs = self.config.add_history(inputs, arguments.to_flags(begins, "begins", len(inputs)))
-            mean_length = np.full(len(inputs), self.store.mean_length)
+            mean_length = np.full(len(inputs), self.store.mean_length, np.int32)
             lengths = mean_length if length is None else arguments.to_lengths(length, len(inputs))
             return self.step_rewards.rewards(inputs, lengths)
 
@@ -327,8 +332,7 @@ class CreditAssigner:
             LareError: the directory does not exist, is damaged, or was written by another version.
         """
         credit = cls.__new__(cls)
-        problem = f"{directory} holds no credit assigner, or one that is damaged or of another version"
-        with report_damage(problem):
+        with report_damage(f"{directory} holds no credit assigner, or one that is damaged or of another version"):
             credit.__setstate__(saving.read_state(Path(directory)))
         return credit
 

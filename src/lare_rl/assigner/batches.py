@@ -39,10 +39,10 @@ def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, lo
 
 def whole_episodes(store: Store, spec: CreditSpec, episodes: Sequence[StoredEpisode]) -> Iterator[CreditBatch]:
     """Yield batches of whole episodes, in their order. Rows are padded to one of two sizes, so that few programs are compiled."""
-    lengths = [len(episode.step_ids) for episode in episodes]
-    longest = max(lengths, default=1)
+    lengths = _lengths(episodes)
+    longest = int(lengths.max(initial=1))
     rows = padded_size(longest)
-    if sum(lengths) > rows:
+    if lengths.sum() > rows:
         rows = padded_size(max(longest, min(MAX_CALL_ROWS // spec.agents, spec.window * longest)))
     return pack_in_order(store, episodes, spec.window, rows)
 
@@ -61,7 +61,7 @@ def _sample_episodes(store: Store, count: int, random: np.random.Generator) -> l
 
 
 def _lengths(episodes: Sequence[StoredEpisode]) -> Int[np.ndarray, " episodes"]:
-    return np.array([len(episode.step_ids) for episode in episodes])
+    return np.array([len(episode.step_ids) for episode in episodes], int)
 
 
 def _pack(store: Store, episodes: Sequence[StoredEpisode], n_slots: int, rows: int) -> CreditBatch:
@@ -74,9 +74,9 @@ def _pack(store: Store, episodes: Sequence[StoredEpisode], n_slots: int, rows: i
 
 
 def _gather(store: Store, episodes: Sequence[StoredEpisode], layout: Layout, n_slots: int) -> CreditBatch:
-    """Return the inputs of the steps of a layout, with the returns of their episodes.
+    """Return the inputs of the steps of a layout, with the returns of their episodes. The batch has room for `n_slots` episodes.
 
-    The layout has an axis of episodes, or none. Padding reads some stored step. The arrays have room for `n_slots` episodes.
+    The layout has an axis of episodes, or none. Its padding reads some stored step.
     """
     count, lengths = len(episodes), _lengths(episodes)
     first = np.cumsum(lengths) - lengths

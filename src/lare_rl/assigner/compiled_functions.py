@@ -1,5 +1,6 @@
 """The compiled functions of a `CreditAssigner`: functions of `lare_rl.credit`, on batches of steps and episodes."""
 
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any
@@ -12,7 +13,7 @@ from lare_rl.credit import closed_form, decoder_state, descent, explanation, lea
 from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.rewards import StepBatch
 from lare_rl.credit.spec import CreditSpec
-from lare_rl.data.layouts import sample_steps as _sample_steps
+from lare_rl.data import layouts
 
 MAX_CALL_ROWS = 8192
 """Rows that are processed in one call."""
@@ -30,14 +31,14 @@ reset_statistics = jax.jit(closed_form.reset_statistics)
 init_explanation = jax.jit(explanation.init_explanation, static_argnames="basis")
 add_to_explanation = jax.jit(explanation.add_to_explanation)
 explain = jax.jit(explanation.explain)
-sample_steps = jax.jit(_sample_steps, static_argnames="steps")
+sample_steps = jax.jit(layouts.sample_steps, static_argnames="steps")
 
 
 @partial(jax.jit, static_argnames="spec")
 def fit_by_gradient(
     state: DecoderState, batches: CreditBatch, keys: Key[Array, " updates"], spec: CreditSpec
 ) -> tuple[DecoderState, Float[Array, ""]]:
-    """Update the decoder once for each of some batches. Also return the mean of their losses."""
+    """Update the decoder once for each batch. Also return the mean of the losses."""
 
     def body(state: DecoderState, inputs: tuple[CreditBatch, Key[Array, ""]]) -> tuple[DecoderState, Float[Array, ""]]:
         state, metrics = descent.update(state, *inputs, spec)
@@ -53,6 +54,11 @@ def training_rewards(
 ) -> Float[Array, "rows agents"]:
     """Return the rewards of steps by a flat `DecoderState`: its leaves and structure, from `jax.tree.flatten`."""
     return rewards.training_rewards(jax.tree.unflatten(structure, leaves), steps, spec)
+
+
+def call_chunks(n_rows: int) -> Iterator[slice]:
+    """Yield the rows of each call, at most `MAX_CALL_ROWS`."""
+    return (slice(start, start + MAX_CALL_ROWS) for start in range(0, n_rows, MAX_CALL_ROWS))
 
 
 def on_cpu() -> AbstractContextManager:

@@ -20,7 +20,7 @@ from jaxtyping import Int
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.batches import sample_batch, whole_episodes
-from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu
+from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, call_chunks, on_cpu
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit import closed_form, learning, prequential
 from lare_rl.credit.decoder_state import DecoderState
@@ -38,7 +38,7 @@ CHUNK_UPDATES = 16
 MAX_PENDING_UPDATES = 256
 """The most gradient updates that may wait. This limits the burst of updates after a long first episode."""
 PHI_SAMPLE_STEPS = 256
-"""About how many steps are kept to verify `phi` again after it is loaded from a file."""
+"""About how many steps `phi` is verified on, after it is loaded from a file."""
 
 
 class DecoderLearner:
@@ -55,7 +55,7 @@ class DecoderLearner:
         self.loss = float("nan")
         """The mean loss of the last gradient updates."""
         self.phi_sample: list[tuple[np.ndarray, np.ndarray]] = []
-        """The first next observations and actions: a `phi` that is loaded from a file is verified on them again."""
+        """The first next observations and actions, on which a `phi` that is loaded from a file is verified."""
         self.n_pending_steps = 0
         self._pending_steps: list[tuple[np.ndarray, ...]] = []
         """Number, observation, action and next observation of steps that have no inputs yet."""
@@ -70,7 +70,6 @@ class DecoderLearner:
 
     @property
     def is_fitted(self) -> bool:
-        """Whether the decoder has been fitted yet."""
         if not self._is_fitted and self.config.method.fit is not None:  # cached, because reading the flag waits for JAX
             uses_gradient = self.config.method.uses_gradient
             self._is_fitted = self.n_updates > 0 if uses_gradient else bool(learning.is_fitted(self.decoder))
@@ -91,7 +90,7 @@ class DecoderLearner:
         """Queue episodes that ended in one call."""
         batch: list[StoredEpisode] = []
         for episode in episodes:
-            if not batch:
+            if not batch:  # queued first, because the iterator raises the refusals of payments at its end
                 self._pending_episodes.append(batch)
             batch.append(episode)
             self._pending_returns.append(episode)
@@ -108,29 +107,27 @@ class DecoderLearner:
         if not self._pending_steps:
             return
         step_ids, *steps = (np.concatenate(arrays) for arrays in zip(*self._pending_steps, strict=True))
-        chunks = [slice(start, start + MAX_CALL_ROWS) for start in range(0, len(step_ids), MAX_CALL_ROWS)]
         # Nothing changes before phi has been called for all steps, because phi may raise an error.
-        all_inputs = [self.config.compute_inputs(*(rows[chunk] for rows in steps)) for chunk in chunks]
-        for chunk, inputs in zip(chunks, all_inputs, strict=True):
-            rows = step_ids[chunk] % self.store.capacity
-            self.store.inputs[rows, ..., : inputs.shape[-1]] = inputs
-            if self.config.spec.basis.n_tracked:
-                self._fill_history(step_ids[chunk])
+        chunks = [self.config.compute_inputs(*(rows[chunk] for rows in steps)) for chunk in call_chunks(len(step_ids))]
+        inputs, rows = np.concatenate(chunks), step_ids % self.store.capacity
+        self.store.inputs[rows, ..., : inputs.shape[-1]] = inputs
+        if self.config.spec.basis.n_tracked:
+            self._fill_history(rows)
+        if self.config.method.fit is not None:
             alive = np.ones(inputs.shape[:-1], bool) if self.store.alive is None else self.store.alive[rows]
-            if self.config.method.fit is not None:
-                self._pending_inputs.append((inputs, alive))
+            self._pending_inputs.append((inputs, alive))
         if self.config.phi is not None and sum(len(action) for _, action in self.phi_sample) < PHI_SAMPLE_STEPS:
-            _, action, next_observation = (rows.reshape(-1, rows.shape[-1])[:PHI_SAMPLE_STEPS].copy() for rows in steps)
-            self.phi_sample.append((next_observation, action))
+            sample = [array.reshape(-1, array.shape[-1])[:PHI_SAMPLE_STEPS].copy() for array in steps]
+            self.phi_sample.append((sample[2], sample[1]))
         self._pending_steps.clear()
         self.n_pending_steps = 0
         if sum(len(inputs) for inputs, _ in self._pending_inputs) >= MAX_PENDING_STEPS:
             self.flush_statistics()
 
-    def _fill_history(self, step_ids: Int[np.ndarray, " n"]) -> None:
-        """Compute the history of steps, whose other inputs are stored. Earlier steps of their episodes have theirs."""
+    def _fill_history(self, rows: Int[np.ndarray, " n"]) -> None:
+        """Compute the history of steps in their order. Their other inputs are stored, and all inputs of earlier steps."""
         store, basis = self.store, self.config.spec.basis
-        rows, size = step_ids % store.capacity, basis.n_standardised
+        size = basis.n_standardised
         for row, previous in zip(rows.tolist(), store.previous[rows].tolist(), strict=True):
             before = store.inputs[previous % store.capacity]
             store.inputs[row, ..., size:] = np.nan if previous < 0 else next_history_columns(before, basis.n_tracked)
@@ -142,11 +139,10 @@ class DecoderLearner:
             return
         inputs, alive = (np.concatenate(arrays) for arrays in zip(*self._pending_inputs, strict=True))
         self._pending_inputs.clear()
-        for start in range(0, len(inputs), MAX_CALL_ROWS):
-            chunk = slice(start, start + MAX_CALL_ROWS)
+        for chunk in call_chunks(len(inputs)):
             size = padded_size(len(inputs[chunk]))
+            rows, mask = pad_rows(inputs[chunk], size), pad_rows(alive[chunk], size)
             with on_cpu():
-                rows, mask = pad_rows(inputs[chunk], size), pad_rows(alive[chunk], size)
                 self.decoder = compiled.observe_steps(self.decoder, rows, mask)
 
     def _flush_returns(self) -> None:
@@ -176,9 +172,9 @@ class DecoderLearner:
         """
         self.flush_inputs()
         self.flush_statistics()
-        oldest = self.store.n_added - self.store.capacity
-        calls = [[episode for episode in batch if episode.step_ids[0] >= oldest] for batch in self._pending_episodes]
-        pending = self._pending_episodes = deque(filter(None, calls))
+        oldest = self.store.oldest_step
+        stored = [[episode for episode in batch if episode.step_ids[0] >= oldest] for batch in self._pending_episodes]
+        pending = self._pending_episodes = deque(filter(None, stored))
         with on_cpu(), float64():
             while pending:
                 new = pending.popleft()
@@ -193,13 +189,14 @@ class DecoderLearner:
         return (closed_form.FIT_GROWTH - 1) * self.n_learned if self.config.spec.has_closed_form else inf
 
     def _learn(self, decoder: DecoderState, new: Sequence[StoredEpisode]) -> DecoderState:
-        """Return a decoder that has learned from some new episodes, while later ones are still pending."""
+        """Return a decoder that has learned from new episodes. Later ones are still pending."""
         for batch in whole_episodes(self.store, self.config.spec, new):
             decoder = compiled.predict_then_update(decoder, batch, spec=self.config.spec)
         closed = decoder.closed_form
         if closed is None:
             return decoder
-        may_rebuild = self.config.forget or self.store.n_added <= self.store.capacity
+        # Sums that are computed anew lack the episodes that are not stored any more.
+        may_rebuild = self.config.forget or self.store.oldest_step == 0
         if self.config.method.fit is not Fit.SIGNS and may_rebuild and compiled.is_stale(closed, decoder.statistics):
             closed = compiled.reset_statistics(closed, decoder.statistics)
             pending = set(map(id, chain.from_iterable(self._pending_episodes)))

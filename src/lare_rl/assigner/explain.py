@@ -1,4 +1,4 @@
-"""Explains the returns that a `CreditAssigner` stores by the factors, whatever its decoder is."""
+"""Sentences that explain the returns that a `CreditAssigner` stores, whatever its decoder is."""
 
 from collections.abc import Hashable, Iterable
 from dataclasses import replace
@@ -20,7 +20,7 @@ __all__ = ["describe_returns", "explain"]
 
 
 def describe_returns(learner: DecoderLearner, group_names: Iterable[Hashable]) -> list[str]:
-    """Return the explanation in sentences. The list is empty for too few episodes, and for a method without a decoder."""
+    """Return the explanation in sentences: none for too few episodes, and for a method without a decoder."""
     learner.learn_returns()
     explanation, decoder, config = explain(learner), learner.decoder, learner.config
     if explanation is None:
@@ -42,5 +42,5 @@ def explain(learner: DecoderLearner) -> Explanation | None:
         state = compiled.init_explanation(decoder.statistics, basis=basis)
         for batch in whole_episodes(store, spec, list(store.episodes.values())):
             state = compiled.add_to_explanation(state, batch)
-        facts = decoder.is_average.astype(int), decoder_state.start_value(decoder)
-        return jax.tree.map(np.asarray, compiled.explain(state, *facts))
+        score_type, start_value = decoder.is_average.astype(int), decoder_state.start_value(decoder)
+        return jax.tree.map(np.asarray, compiled.explain(state, score_type, start_value))

@@ -32,11 +32,11 @@ __all__ = ["AssignerState", "get_state", "read_state", "restore", "write_state"]
 FORMAT = 1
 TEXT_FILE, ARRAYS_FILE, FUNCTION_FILE = "assigner.json", "state.npz", "phi.py"
 LEARNED = "learned"
-"""The names of the arrays of the decoder begin with it."""
+"""The prefix of the names of the decoder's arrays."""
 STORE_ARRAYS = ("inputs", "length", "mean_reward", "episode")
 """The arrays of a store, for each step."""
 PHI_SAMPLE = ("phi_sample/observation", "phi_sample/action")
-"""The steps on which `phi` is verified when it is loaded, because there may be no environment."""
+"""The arrays on which `phi` is verified when it is loaded, because there may be no environment."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ def restore(learner: DecoderLearner, state: AssignerState) -> None:
     """Give a new learner the state of a saved one. Raises `KeyError` or `ValueError` if the arrays do not fit."""
     arrays = rename_assigner(state.arrays)
     learner.n_learned, learner.n_updates = state.n_learned, state.n_updates
-    if set(PHI_SAMPLE) <= set(arrays):
-        learner.phi_sample.append((arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]))
+    if sample := _phi_sample(arrays):
+        learner.phi_sample.append(sample)
     learned = {name.removeprefix(LEARNED): array for name, array in arrays.items()}
     (learner.decoder,) = fill_template((learner.decoder,), learned)
     store = learner.store
@@ -94,8 +94,7 @@ def write_state(state: AssignerState, directory: Path) -> None:
         "n_learned": state.n_learned,
         "n_updates": state.n_updates,
     }
-    text = json.dumps(values, indent=1).encode()
-    write_bytes(directory / TEXT_FILE, text)
+    write_bytes(directory / TEXT_FILE, json.dumps(values, indent=1).encode())
 
 
 def read_state(directory: Path) -> AssignerState:
@@ -114,8 +113,7 @@ def read_state(directory: Path) -> AssignerState:
     task = None if values["task"] is None else TaskSpec(**values["task"])
     phi = None
     if task is not None and values["phi"]:
-        sample = (arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]) if set(PHI_SAMPLE) <= set(arrays) else None
-        phi = load_function(directory / FUNCTION_FILE, task, steps=sample)
+        phi = load_function(directory / FUNCTION_FILE, task, steps=_phi_sample(arrays))
     if isinstance(values["settings"], dict):
         values["settings"].setdefault("start_value", False)  # of an earlier version
     fields = {name: values[name] for name in AssignerConfig.model_fields.keys() & values.keys()}
@@ -124,8 +122,14 @@ def read_state(directory: Path) -> AssignerState:
     return AssignerState(config, values["n_learned"], values["n_updates"], arrays, group_names)
 
 
+def _phi_sample(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the arrays of `PHI_SAMPLE`, or None without them."""
+    observation, action = map(arrays.get, PHI_SAMPLE)
+    return None if observation is None or action is None else (observation, action)
+
+
 def _store_arrays(store: Store) -> dict[str, np.ndarray]:
-    rows = np.arange(max(0, store.n_added - store.capacity), store.n_added) % store.capacity
+    rows = store.stored_rows
     numbers = [number for _, number in store.oldest]  # in the order from which batches are sampled
     episodes = [store.episodes[number] for number in numbers]
     return {
@@ -142,7 +146,7 @@ def _store_arrays(store: Store) -> dict[str, np.ndarray]:
 
 def _restore_store(store: Store, arrays: dict[str, np.ndarray]) -> None:
     store.n_added = int(arrays["n_added"])
-    rows = np.arange(max(0, store.n_added - store.capacity), store.n_added) % store.capacity
+    rows = store.stored_rows
     for name in STORE_ARRAYS:
         if name in arrays:  # earlier versions did not save every array
             getattr(store, name)[rows] = arrays[name]
@@ -153,9 +157,8 @@ def _restore_store(store: Store, arrays: dict[str, np.ndarray]) -> None:
     # Earlier versions saved neither levels nor numbers.
     levels = arrays.get("levels", np.zeros(len(ends), np.int64)).tolist()
     numbers = arrays.get("numbers", store.n_ended - len(ends) + np.arange(len(ends))).tolist()
-    for end, length, score, level, number in zip(
-        ends, arrays["lengths"], arrays["scores"], levels, numbers, strict=True
-    ):
-        steps = arrays["episodes"][end - length : end]
-        store.put_episode(number, StoredEpisode(steps, float(score), level))
+    episodes = np.split(arrays["episodes"], ends)[:-1]
+    scores = arrays["scores"].tolist()
+    for number, step_ids, score, level in zip(numbers, episodes, scores, levels, strict=True):
+        store.put_episode(number, StoredEpisode(step_ids, score, level))
     store.episodes = dict(sorted(store.episodes.items()))

@@ -81,7 +81,6 @@ class SpaceLayout(CheckedModel):
         return np.concatenate(arrays, axis=-1)
 
     def _one_hot(self, array: Shaped[np.ndarray, "*shape"], name: str) -> Float[np.ndarray, "*batch size"]:
-        """Return choices as rows: a one-hot vector for each choice."""
         is_single = not self.shape
         if is_single and array.ndim and array.shape[-1] == self.size and array.dtype.kind == "f":
             return _to_float32(array)

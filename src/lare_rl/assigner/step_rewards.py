@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.batches import whole_episodes
-from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu
+from lare_rl.assigner.compiled_functions import call_chunks, on_cpu
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.credit import decoder_state
 from lare_rl.credit.decoder_state import DecoderState
@@ -29,7 +29,7 @@ class StepRewards:
     def __init__(self, learner: DecoderLearner):
         self.learner, self.config, self.store = learner, learner.config, learner.store
         self._flat_cache: tuple[Any, list[Array], Any] = None, [], None
-        """A decoder, its leaves, and its structure. Flattening it anew for every call would take longer than the call."""
+        """A decoder, its leaves and its structure. To flatten it in every call would take longer than the call."""
         self._residual_cache: tuple[DecoderState | None, dict[int, float]] = None, {}
         """A decoder, and the residuals R - sum_t r_hat_t of episodes, by their numbers."""
 
@@ -41,28 +41,41 @@ class StepRewards:
             self.learner.flush_inputs()
         is_exact = self.config.spec.is_exact and self.learner.is_fitted
         last, residual = self._residuals(step_ids, rows) if is_exact else (np.zeros(len(rows), bool), None)
-        alive = np.ones((len(rows), self.config.agents), bool) if store.alive is None else store.alive[rows]
-        ended, inputs, mean_reward = store.length[rows] > 0, store.inputs[rows], store.mean_reward[rows]
-        arrays: Any = inputs, store.lengths(rows), mean_reward, ended, last, alive, residual
-        return self._compute(StepBatch(*arrays))
+        return self._compute(
+            inputs=store.inputs[rows],
+            length=store.lengths(rows),
+            mean_reward=store.mean_reward[rows],
+            episode_ended=store.length[rows] > 0,
+            last=last,
+            alive=None if store.alive is None else store.alive[rows],
+            residual=residual,
+        )
 
     def rewards(
         self, inputs: Float[np.ndarray, "n *agents inputs"], length: Int[np.ndarray, " n"]
     ) -> Float[np.ndarray, "n *agents"]:
         """Return the rewards of any steps, by the lengths of their episodes. The method must not need returns."""
-        ended, alive = np.ones(len(length), bool), np.ones((len(length), self.config.agents), bool)
-        arrays: Any = inputs, length, np.zeros(len(length), np.float32), ended, ended, alive
-        return self._compute(StepBatch(*arrays))
+        ended, unknown = np.ones(len(length), bool), np.zeros(len(length), np.float32)
+        return self._compute(
+            inputs=inputs, length=length, mean_reward=unknown, episode_ended=ended, last=ended, alive=None
+        )
 
-    def _compute(self, steps: StepBatch) -> Float[np.ndarray, "n *agents"]:
-        """Return the rewards of steps (NumPy arrays), in chunks of few sizes, so that few programs are compiled; 0 before the first fit."""
-        reward = np.zeros(steps.inputs.shape[:-1], np.float32)
+    def _compute(self, **arrays: Any) -> Float[np.ndarray, "n *agents"]:
+        """Return the rewards of steps, by the fields of `StepBatch`. They are 0 before the first fit.
+
+        `alive` may be None: all agents are.
+        """
+        inputs = arrays["inputs"]
+        reward = np.zeros(inputs.shape[:-1], np.float32)
         if self.config.method.reward is Reward.PROXY and not self.learner.is_fitted:
             return reward
-        inputs = steps.inputs.reshape(len(reward), self.config.agents, steps.inputs.shape[-1])
-        steps = steps._replace(inputs=inputs, length=steps.length.astype(np.int32))
-        for start in range(0, len(reward), MAX_CALL_ROWS):
-            chunk = slice(start, start + MAX_CALL_ROWS)
+        agent_shape = len(reward), self.config.agents
+        arrays["inputs"] = inputs.reshape(*agent_shape, inputs.shape[-1])
+        if arrays["alive"] is None:
+            arrays["alive"] = np.ones(agent_shape, bool)
+        steps = StepBatch(**arrays)
+        # Chunks have few sizes, so that few programs are compiled.
+        for chunk in call_chunks(len(reward)):
             selected = jax.tree.map(itemgetter(chunk), steps)
             count = len(selected.length)
             padded = jax.tree.map(partial(pad_rows, size=padded_size(count)), selected)
@@ -83,14 +96,15 @@ class StepRewards:
     def _residuals(
         self, step_ids: Int[np.ndarray, " n"], rows: Int[np.ndarray, " n"]
     ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Return which steps end a stored episode, and the residual of each step's episode; 0 where none is known or added."""
+        """Return which steps end a stored episode, and the residual that `exact` adds for each step; 0 where it adds none."""
         number = self.store.episode[rows]
-        stored = [self.store.episodes.get(k) for k in number.tolist()]
-        last = np.array([e is not None and e.step_ids[-1] == k for e, k in zip(stored, step_ids, strict=True)], bool)
-        is_used = last if self.config.settings.exact == "last" else np.array([e is not None for e in stored], bool)
-        numbers = np.unique(number[is_used])
+        episodes = [self.store.episodes.get(k) for k in number.tolist()]
+        last_ids = np.array([-1 if episode is None else episode.step_ids[-1] for episode in episodes], np.int64)
+        last = step_ids == last_ids
+        is_used = last if self.config.settings.exact == "last" else last_ids >= 0
+        numbers, index = np.unique(number[is_used], return_inverse=True)
         residual = np.zeros(len(rows), np.float32)
-        residual[is_used] = self._episode_residuals(numbers.tolist())[np.searchsorted(numbers, number[is_used])]
+        residual[is_used] = self._episode_residuals(numbers.tolist())[index]
         return last, residual
 
     def _episode_residuals(self, numbers: Sequence[int]) -> Float[np.ndarray, " episodes"]:
@@ -111,9 +125,9 @@ class StepRewards:
         return np.array([residuals[number] for number in numbers], np.float32)
 
     def unpaid_return(self, level: int | None, length: Int[np.ndarray, " payments"]) -> float:
-        """Return the part of an episode's return that no proxy reward contains: that of its level, or of all episodes.
+        """Return the sum of what no proxy reward contains of each payment of an episode: that of its level, or of all episodes.
 
-        `level` is None if it is unknown. `length` has the number of steps of each segment.
+        `level` is None if it is unknown. `length` has the number of steps of each payment.
         """
         decoder = self.learner.decoder
         if not self.learner.is_fitted:

@@ -31,7 +31,6 @@ class StoredEpisode(NamedTuple):
     return_: float
     """R."""
     level: int = 0
-    """Its level."""
 
 
 @dataclass
@@ -39,9 +38,9 @@ class RunningEpisode:
     """An episode that has not ended."""
 
     step_ids: MutableSequence[int] = field(default_factory=partial(array, "q"))
-    """The numbers of its steps. An episode may have millions of them."""
+    """The numbers of its steps, of which there may be millions."""
     level: int = -1
-    """Its level; -1 before a step has one."""
+    """-1 before a step has one."""
     n_paid: int = 0
     """The number of steps up to the last payment."""
     return_: float = 0.0
@@ -72,25 +71,25 @@ class Store:
         `row_shape` is the shape of a step's inputs: (inputs,), or (agents, inputs). `longest` is the largest number of steps that the
         decoder reads of an episode; None if any.
         """
-        self.capacity, self.agents, self.payments, self.has_levels = capacity, agents, payments, has_levels
-        self.longest = longest
+        self.capacity, self.agents, self.payments = capacity, agents, payments
+        self.has_levels, self.longest = has_levels, longest
         try:
             self.inputs = np.zeros((capacity, *row_shape), np.float32)
             """The decoder's inputs for each step: [capacity *agents inputs]."""
+            self.length = np.zeros(capacity, np.int32)
+            """The length of each step's episode; 0 before it is paid."""
+            self.mean_reward = np.zeros(capacity, np.float32)
+            """R/T of each step's episode."""
+            self.episode = np.full(capacity, -1, np.int64)
+            """The number of each step's episode; -1 before it is paid."""
+            self.previous = np.full(capacity, -1, np.int64)
+            """The number of the step before each step since the last payment; -1 for the first one."""
         except (MemoryError, ValueError) as error:  # ValueError: more numbers than NumPy can count
             raise LareError(
                 f"capacity = {capacity} steps do not fit into the memory: make it (or memory of relabel) smaller"
             ) from error
         self.alive: Bool[np.ndarray, "capacity agents"] | None = None
         """Which agents acted. None: all of them."""
-        self.length = np.zeros(capacity, np.int32)
-        """The length of each step's episode; 0 before it is paid."""
-        self.mean_reward = np.zeros(capacity, np.float32)
-        """R/T of each step's episode."""
-        self.episode = np.full(capacity, -1, np.int64)
-        """The number of each step's episode; -1 before it is paid."""
-        self.previous = np.full(capacity, -1, np.int64)
-        """The number of the step before each step since the last payment; -1 for the first one."""
         self.n_added = 0
         """The number of steps that were ever added."""
         self.episodes: dict[int, StoredEpisode] = {}
@@ -98,7 +97,7 @@ class Store:
         self.n_ended = 0
         """The number of payments that were ever stored: of episodes that have ended, if each is paid once."""
         self.n_ended_steps = 0
-        """The sum of the numbers of steps that these payments are for."""
+        """The number of steps that these payments are for, in total."""
         self.oldest: list[tuple[int, int]] = []
         """A heap of the stored episodes: first step, and number."""
         self.running: dict[Hashable, RunningEpisode] = {}
@@ -112,6 +111,16 @@ class Store:
         arrays = self.inputs, self.length, self.mean_reward, self.episode, self.previous
         return sum(array.nbytes for array in arrays) // self.capacity
 
+    @property
+    def oldest_step(self) -> int:
+        """The number of the oldest step that is stored."""
+        return max(0, self.n_added - self.capacity)
+
+    @property
+    def stored_rows(self) -> Int[np.ndarray, " stored_steps"]:
+        """The rows of the stored steps, from the oldest to the newest."""
+        return np.arange(self.oldest_step, self.n_added) % self.capacity
+
     def add(self, n_steps: int, alive: Bool[np.ndarray, "n_steps agents"] | None = None) -> Int[np.ndarray, " n_steps"]:
         """Return numbers for new steps.
 
@@ -122,19 +131,19 @@ class Store:
         """
         if n_steps > self.capacity:
             raise LareError(f"{n_steps} steps at once are more than capacity = {self.capacity}: make capacity larger")
-        while self.running and next(iter(self.running.values())).step_ids[-1] < self.n_added - self.capacity:
+        while self.running and next(iter(self.running.values())).step_ids[-1] < self.oldest_step:
             self.drop(next(iter(self.running)))
         step_ids = np.arange(self.n_added, self.n_added + n_steps)
         self.n_added += n_steps
-        while self.oldest and self.oldest[0][0] < self.n_added - self.capacity:
+        while self.oldest and self.oldest[0][0] < self.oldest_step:
             del self.episodes[heapq.heappop(self.oldest)[1]]
-        self.length[step_ids % self.capacity] = 0
-        self.episode[step_ids % self.capacity] = -1
-        self.previous[step_ids % self.capacity] = -1
+        rows = step_ids % self.capacity
+        self.length[rows] = 0
+        self.episode[rows] = self.previous[rows] = -1
         if self.alive is None and alive is not None:
             self.alive = np.ones((self.capacity, self.agents), bool)
         if self.alive is not None:
-            self.alive[step_ids % self.capacity] = True if alive is None else alive
+            self.alive[rows] = True if alive is None else alive
         return step_ids
 
     def extend(
@@ -144,21 +153,19 @@ class Store:
         transition: Sequence[np.ndarray],
         reward: Float[np.ndarray, " n"],
         ended: Bool[np.ndarray, " n"],
-        level: Int[np.ndarray, " n"] | None = None,
+        level: Int[np.ndarray, " n"],
     ) -> Iterator[StoredEpisode]:
         """Add new steps to the running episodes of their environments. Yield each episode that is paid.
 
-        `step_ids` are from `add`. `transition` holds observations, actions and next observations. Once all steps are added, raises the
-        first `LareError` of their payments, like `end`.
+        `step_ids` are from `add`. `transition` holds observations, actions and next observations. `level` is -1 for a step that leaves
+        the level of its episode unchanged. Once all steps are added, raises the first `LareError` of their payments, like `end`.
         """
         observation, _, next_observation = transition
 
         def read_steps() -> Iterator[_Step]:
             for i, env_id in enumerate(env_ids):
                 episode = self.get_running(env_id, observation[i])
-                if level is None:
-                    episode.level = 0
-                elif level[i] >= 0:
+                if level[i] >= 0:
                     episode.level = int(level[i])
                 episode.last_observation = next_observation[i]
                 if ended[i]:
@@ -168,29 +175,22 @@ class Store:
         return self._add_steps(read_steps(), self.payments)
 
     def _add_steps(self, steps: Iterable[_Step], payments: PaymentRule) -> Iterator[StoredEpisode]:
-        """Add steps to their episodes. Yield each episode that is paid, and raise the first refusal of a payment at the end."""
+        """Add steps to their episodes. Yield each episode that is paid. At the end, raise the first refusal of a payment."""
         error = None
         for episode, step_id, reward, ended in steps:
-            try:
-                payment = self._add_step(episode, step_id, reward, payments, ended)
-            except LareError as refusal:
-                error = error or refusal
-                continue
-            if payment is not None:
-                yield payment
+            if len(episode.step_ids) > episode.n_paid:
+                self.previous[step_id % self.capacity] = episode.step_ids[-1]
+            episode.step_ids.append(step_id)
+            episode.return_ += reward
+            if is_paid(payments, len(episode.step_ids) - 1, np.array([reward]), ended):
+                try:
+                    payment = self._pay(episode, episode.return_, payments.window)
+                except LareError as refusal:
+                    error = error or refusal
+                else:
+                    yield payment
         if error is not None:
             raise error
-
-    def _add_step(
-        self, episode: RunningEpisode, step_id: int, reward: float, payments: PaymentRule, ended: bool
-    ) -> StoredEpisode | None:
-        """Add a step to an episode. Return the paid episode if the step is paid, else None."""
-        if len(episode.step_ids) > episode.n_paid:
-            self.previous[step_id % self.capacity] = episode.step_ids[-1]
-        episode.step_ids.append(step_id)
-        episode.return_ += reward
-        is_payment = is_paid(payments, len(episode.step_ids) - 1, np.array([reward]), ended)
-        return self._pay(episode, episode.return_, payments.window) if is_payment else None
 
     def end(self, env_id: Hashable, score: float | None = None) -> StoredEpisode:
         """End the running episode of an environment, with `score` as its return, or as its last payment.
@@ -228,7 +228,7 @@ class Store:
                 f"the decoder reads at most {self.longest} steps for one payment, and this one is for {len(step_ids)}: use rudder, or "
                 "payments"
             )
-        if self.n_added - step_ids[0] > self.capacity:
+        if step_ids[0] < self.oldest_step:
             self.dropped += 1
             raise LareError(
                 f"an episode of {len(step_ids)} steps has ended, and its first steps are not stored any more: "
@@ -236,7 +236,7 @@ class Store:
             )
         payment = StoredEpisode(step_ids, return_, episode.level)
         self.put_episode(self.n_ended, payment)
-        rows = since_last[since_last >= self.n_added - self.capacity] % self.capacity
+        rows = since_last[since_last >= self.oldest_step] % self.capacity
         self.episode[rows] = self.n_ended
         self.length[rows] = len(step_ids)
         self.mean_reward[rows] = return_ / len(step_ids)
@@ -251,10 +251,7 @@ class Store:
         payments: PaymentRule,
         level: int = 0,
     ) -> Iterator[StoredEpisode]:
-        """Store an episode that has just ended, by the reward of each of its steps. Yield the steps of each payment.
-
-        Once all steps are added, raises the first `LareError` of the payments, like `end`.
-        """
+        """Store an episode that has just ended, by the reward of each of its steps. Yield and raise like `extend`."""
         episode, last = RunningEpisode(level=level), len(step_ids) - 1
         steps = ((episode, step_id, float(reward[i]), i == last) for i, step_id in enumerate(step_ids.tolist()))
         return self._add_steps(steps, payments)
@@ -270,13 +267,12 @@ class Store:
         If the last step led to a different observation, the environment was reset in between: the running episode is abandoned, and a
         new one begins.
         """
-        run = self.running.get(env_id)
-        last = None if run is None else run.last_observation
+        last = self.running[env_id].last_observation if env_id in self.running else None
         if last is not None and not np.array_equal(last, observation):
             self.drop(env_id)
-        run = self.running.pop(env_id, None) or RunningEpisode()
-        self.running[env_id] = run  # now the last of all environments
-        return run
+        episode = self.running.pop(env_id, None) or RunningEpisode()
+        self.running[env_id] = episode  # now the last of all environments
+        return episode
 
     def drop(self, env_id: Hashable) -> None:
         """Abandon the running episode of an environment. Its steps stay stored, and are never learned from."""
@@ -284,10 +280,9 @@ class Store:
 
     def rows(self, step_ids: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
         """Return the rows of stored steps. Raises `LareError` if a step was never stored, or is not stored any more."""
-        oldest = max(0, self.n_added - self.capacity)
-        missing = step_ids[(step_ids < oldest) | (step_ids >= self.n_added)]
+        missing = step_ids[(step_ids < self.oldest_step) | (step_ids >= self.n_added)]
         if missing.size:
-            stored = f"steps {oldest} to {self.n_added - 1} are" if self.n_added else "no step is"
+            stored = f"steps {self.oldest_step} to {self.n_added - 1} are" if self.n_added else "no step is"
             raise LareError(f"step {missing[0]} is not stored: {stored} (capacity = {self.capacity})")
         return step_ids % self.capacity
 
@@ -295,14 +290,14 @@ class Store:
         """Return T of each step's payment. Before it is paid: the window; without one, its steps so far, but at least the mean length."""
         length, mean_length = self.length[rows], self.mean_length
         is_running = length == 0
-        if self.payments.window is not None:
-            return np.where(is_running, self.payments.window, length)
-        length = np.where(is_running, mean_length, length)
-        for episode in self.running.values() if is_running.any() else ():
+        length[is_running] = self.payments.window or mean_length
+        if self.payments.window is not None or not is_running.any():
+            return length
+        for episode in self.running.values():
             n_steps = len(episode.step_ids) - episode.n_paid
             if n_steps > mean_length:
                 unpaid = np.array(episode.step_ids[episode.n_paid :])
-                length[np.isin(rows, unpaid[unpaid >= self.n_added - self.capacity] % self.capacity)] = n_steps
+                length[np.isin(rows, unpaid[unpaid >= self.oldest_step] % self.capacity)] = n_steps
         return length
 
     @property

@@ -37,9 +37,9 @@ def extend(
         ended: whether a step was the last of its episode.
         level: the level of each step's episode.
     """
-    lead = jax.tree.map(jnp.asarray, (dict(columns), dict(next_columns), team_reward, ended, level))
+    arrays = jax.tree.map(jnp.asarray, (dict(columns), dict(next_columns), team_reward, ended, level))
     extend_env = jax.vmap(partial(_extend_env, payments=payments))
-    return extend_env(replay, *jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), lead))
+    return extend_env(replay, *jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), arrays))
 
 
 def set_newest(replay: Replay, name: str, values: Array) -> Replay:
@@ -48,6 +48,23 @@ def set_newest(replay: Replay, name: str, values: Array) -> Replay:
     row = look_up(replay.row, env, number) % capacity(replay)
     column = replay.columns[name].at[env, row].set(jnp.swapaxes(values, 0, 1))
     return replay._replace(columns={**replay.columns, name: column})
+
+
+def abandon_running(replay: Replay, abandoned: Bool[Array, " envs"]) -> Replay:
+    """Forget the running episodes of some environments."""
+    env, first = jnp.arange(len(abandoned)), first_transition(replay, replay.current_episode)
+    removed, segments = abandoned & replay.running, replay.segments
+    if segments is not None:
+        segments = segments._replace(
+            current_episode=jnp.where(removed, look_up(segments.episode, env, first), segments.current_episode),
+            running=segments.running & ~removed,
+        )
+    return replay._replace(
+        next_transition=jnp.where(removed, first, replay.next_transition),
+        next_row=jnp.where(removed, look_up(replay.row, env, first), replay.next_row),
+        running=replay.running & ~removed,
+        segments=segments,
+    )
 
 
 def _extend_env(
@@ -60,7 +77,7 @@ def _extend_env(
     payments: PaymentRule,
 ) -> Replay:
     """Store the steps of one environment, all at once. Remove the oldest episodes if their rows are needed."""
-    rows, steps = replay.row.shape[0], ended.shape[0]
+    rows, steps = capacity(replay), len(ended)
     row = replay.next_row + jnp.arange(steps) + jnp.cumsum(ended) - ended
     number = replay.next_transition + jnp.arange(steps)
     oldest = _remove_oldest(replay, row[-1] + 1)
@@ -119,8 +136,8 @@ def _extend_segments(
     payments: PaymentRule,
 ) -> Segments:
     """Return the segments of one environment after new steps, which are already part of the replay's episodes."""
-    rows, slots = replay.row.shape[0], segments.first.shape[0]
-    number = replay.next_transition - len(ended) + jnp.arange(len(ended))
+    rows, slots, steps = capacity(replay), segments.first.shape[0], len(ended)
+    number = replay.next_transition - steps + jnp.arange(steps)
     begin = replay.first[replay.episode[number % rows] % replay.first.shape[0]]
     pays = is_paid(payments, number - begin, team_reward, ended)
     new = segments._replace(**_extend_episodes(segments, number, team_reward, pays, level))
@@ -138,27 +155,10 @@ def _extend_segments(
 
 def _remove_oldest(replay: Replay, last: Int[Array, ""]) -> Int[Array, ""]:
     """Return the oldest episode that stays when rows up to `last` are written: none of its rows is overwritten."""
-    rows, slots = replay.row.shape[0], replay.first.shape[0]
+    rows, slots = capacity(replay), replay.first.shape[0]
 
     def is_overwritten(oldest: Int[Array, ""]) -> Bool[Array, ""]:
         row = replay.row[replay.first[oldest % slots] % rows]
         return (oldest < replay.current_episode) & (last - row >= rows)
 
     return jax.lax.while_loop(is_overwritten, lambda oldest: oldest + 1, replay.oldest)
-
-
-def abandon_running(replay: Replay, abandoned: Bool[Array, " envs"]) -> Replay:
-    """Forget the running episodes of some environments."""
-    env, first = jnp.arange(len(abandoned)), first_transition(replay, replay.current_episode)
-    removed, segments = abandoned & replay.running, replay.segments
-    if segments is not None:
-        segments = segments._replace(
-            current_episode=jnp.where(removed, look_up(segments.episode, env, first), segments.current_episode),
-            running=segments.running & ~removed,
-        )
-    return replay._replace(
-        next_transition=jnp.where(removed, first, replay.next_transition),
-        next_row=jnp.where(removed, look_up(replay.row, env, first), replay.next_row),
-        running=replay.running & ~removed,
-        segments=segments,
-    )

@@ -44,9 +44,9 @@ def lay_out_packed(length: Any, mask: Any, rows: int) -> tuple[Layout, Any]:
     mask = mask * (end <= rows)
     row = xp.arange(rows)
     slot = xp.minimum(xp.searchsorted(end, row, side="right"), len(length) - 1)
-    belongs = (mask[slot] > 0) & (row < end[slot])
-    step = xp.where(belongs, row - (end - length)[slot], 0)
-    return Layout(xp.where(belongs, slot, len(length)), step), mask
+    is_step = (mask[slot] > 0) & (row < end[slot])
+    step = xp.where(is_step, row - (end - length)[slot], 0)
+    return Layout(xp.where(is_step, slot, len(length)), step), mask
 
 
 def lay_out_padded(length: Any, rows_per_episode: int) -> Layout:
@@ -73,8 +73,8 @@ def lay_out_sampled(length: Any, step: Any) -> Layout:
     """
     xp = jnp if isinstance(length, jax.Array) else np
     count = length.shape[-1]
-    belongs = xp.arange(step.shape[-1]) < length[..., None]
-    return Layout(xp.where(belongs, xp.arange(count)[:, None], count), step)
+    is_step = xp.arange(step.shape[-1]) < length[..., None]
+    return Layout(xp.where(is_step, xp.arange(count)[:, None], count), step)
 
 
 def sample_steps(key: PRNGKeyArray, length: Int[Array, "*episodes"], steps: int) -> Int[Array, "*episodes {steps}"]:

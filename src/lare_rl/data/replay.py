@@ -28,6 +28,30 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 
+__all__ = [
+    "STEP_COLUMNS",
+    "Index",
+    "Replay",
+    "Segments",
+    "StoredSteps",
+    "capacity",
+    "end_of_episode",
+    "first_transition",
+    "hide_newest",
+    "init_replay",
+    "look_up",
+    "mean_length",
+    "n_stored_episodes",
+    "n_stored_transitions",
+    "newest_steps",
+    "oldest_transition",
+    "payment_start",
+    "read",
+    "replace_payment_fields",
+    "required_capacity",
+    "segments_as_episodes",
+]
+
 STEP_COLUMNS = ("observation", "state", "available", "alive")
 """Columns that exist before and after a step. The values after a step are in the next row."""
 
@@ -72,9 +96,9 @@ class Replay(NamedTuple):
     first_paid: Int[Array, "envs episodes"] | None = None
     """Number of the first transition that a payment is for. None means the first one of the episode."""
     predicted_return: Float[Array, "envs episodes teams"] | None = None
-    """Sum of an episode's proxy rewards, or NaN if it has not been computed. None if nobody asks for it."""
+    """Sum of an episode's proxy rewards, or NaN if it has not been computed. None if it is not stored."""
     level: Int[Array, "envs episodes"] | None = None
-    """The level that an episode belongs to. None if there are none."""
+    """An episode's level. None without levels."""
     segments: Segments | None = None
     """None if each episode is paid once, at its end."""
 
@@ -102,11 +126,11 @@ class StoredSteps(NamedTuple):
     last: Bool[Array, "*batch"]
     """Whether the step is the last one of an episode that has ended."""
     residual: Float[Array, "*batch teams"] | None
-    """The return of the step's episode, less the sum of its proxy rewards; 0 if that is unknown. None if nobody asks for it."""
+    """The return of the step's episode, less the sum of its proxy rewards; 0 if that is unknown. None if it is not stored."""
     level: Int[Array, "*batch"] | None
     """The level of the step's episode. Valid at the last step."""
     length: Int[Array, "*batch"]
-    """Steps of its episode. If it is running: at least the mean length of the ended episodes."""
+    """T of the step's episode. While it is running: its steps so far, but at least the mean length of finished episodes."""
 
 
 def init_replay(

@@ -44,7 +44,7 @@ class EpisodeSample(NamedTuple):
     mask: Float[Array, "*batch"]
     """1, or 0 for an entry without an episode."""
     level: Int[Array, "*batch"] | None = None
-    """The level of each. None if there are none."""
+    """The level of each. None without levels."""
 
 
 class CreditSample(NamedTuple):
@@ -55,14 +55,6 @@ class CreditSample(NamedTuple):
     episode: Int[Array, "*updates rows"]
     """The index of each row's episode; for padding, the number of episodes."""
     episodes: EpisodeSample
-
-
-def _sample_items(counts: Int[Array, " envs"], key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
-    """Sample uniformly from the items of all environments. `number` counts from 0 in each environment."""
-    ends = jnp.cumsum(counts)
-    number = jax.random.randint(key, shape, 0, jnp.maximum(ends[-1], 1))
-    env = jnp.minimum(jnp.searchsorted(ends, number, side="right"), len(counts) - 1)
-    return Index(env, number - (ends - counts)[env])
 
 
 def sample_transitions(replay: Replay, key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
@@ -103,16 +95,6 @@ def get_episodes(replay: Replay, index: Index) -> EpisodeSample:
     )
 
 
-def _credit_sample(episodes: EpisodeSample, layout: Layout) -> CreditSample:
-    """Return the sample with this layout, which has the same number of rows for each episode."""
-    lead = episodes.length.shape[:-1]
-    env = jnp.broadcast_to(episodes.first.env[..., None], layout.step.shape)
-    number = episodes.first.number[..., None] + layout.step
-    return CreditSample(
-        Index(env.reshape(*lead, -1), number.reshape(*lead, -1)), layout.slot.reshape(*lead, -1), episodes
-    )
-
-
 def sample_episode_steps(replay: Replay, key: PRNGKeyArray, updates: int, count: int, steps: int) -> CreditSample:
     """Sample `steps` steps of each of `count` episodes, for RRD."""
     episodes_key, steps_key = jax.random.split(key)
@@ -139,14 +121,6 @@ def sample_packed(replay: Replay, key: PRNGKeyArray, updates: int, steps: int, r
     return jax.vmap(sample_update)(jax.random.split(key, updates))
 
 
-def _pack(episodes: EpisodeSample, rows: int) -> CreditSample:
-    """Put whole episodes one after the other. Episodes that do not fit into the rows are left out."""
-    layout, mask = lay_out_packed(episodes.length, episodes.mask, rows)
-    slot = jnp.where(layout.slot < len(mask), layout.slot, 0)  # padding reads a step that is certainly stored
-    steps = Index(episodes.first.env[slot], episodes.first.number[slot] + layout.step)
-    return CreditSample(steps, layout.slot, episodes._replace(mask=mask))
-
-
 def count_episodes_since(replay: Replay, since: Int[Array, " envs"]) -> Int[Array, " envs"]:
     """Return how many finished episodes of each environment have this number or a later one, and are still stored."""
     return jnp.maximum(replay.current_episode - jnp.maximum(since, replay.oldest), 0)
@@ -166,6 +140,32 @@ def episodes_in_order(
     number = jnp.maximum(since, replay.oldest)[env] + position - (ends - counts)[env]
     episodes = get_episodes(replay, Index(env, number - replay.oldest[env]))
     return _pack(episodes._replace(mask=episodes.mask * (position < ends[-1])), rows)
+
+
+def _sample_items(counts: Int[Array, " envs"], key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
+    """Sample uniformly from the items of all environments. `number` counts from 0 in each environment."""
+    ends = jnp.cumsum(counts)
+    number = jax.random.randint(key, shape, 0, jnp.maximum(ends[-1], 1))
+    env = jnp.minimum(jnp.searchsorted(ends, number, side="right"), len(counts) - 1)
+    return Index(env, number - (ends - counts)[env])
+
+
+def _credit_sample(episodes: EpisodeSample, layout: Layout) -> CreditSample:
+    """Return the sample with this layout, which has the same number of rows for each episode."""
+    lead = episodes.length.shape[:-1]
+    env = jnp.broadcast_to(episodes.first.env[..., None], layout.step.shape)
+    number = episodes.first.number[..., None] + layout.step
+    return CreditSample(
+        Index(env.reshape(*lead, -1), number.reshape(*lead, -1)), layout.slot.reshape(*lead, -1), episodes
+    )
+
+
+def _pack(episodes: EpisodeSample, rows: int) -> CreditSample:
+    """Put whole episodes one after the other. Episodes that do not fit into the rows are left out."""
+    layout, mask = lay_out_packed(episodes.length, episodes.mask, rows)
+    slot = jnp.where(layout.slot < len(mask), layout.slot, 0)  # padding reads a step that is certainly stored
+    steps = Index(episodes.first.env[slot], episodes.first.number[slot] + layout.step)
+    return CreditSample(steps, layout.slot, episodes._replace(mask=mask))
 
 
 def _n_finished_steps(replay: Replay) -> Int[Scalar, ""]:

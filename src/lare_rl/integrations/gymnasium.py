@@ -48,7 +48,7 @@ class Credit(gymnasium.Wrapper, RecordConstructorArgs):
 
         Raises `LareError` if the assigner was made for other spaces, or for many agents.
         """
-        # A copy of the assigner would learn from nothing but this environment.
+        # A copy of the assigner would learn from this environment alone.
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, credit=credit, pay=pay, score=score)
         gymnasium.Wrapper.__init__(self, env)
         check_pay(pay)
@@ -79,8 +79,7 @@ class Credit(gymnasium.Wrapper, RecordConstructorArgs):
         self._observation = deepcopy(observation)
         info = {TRUE_REWARD: float(reward), **info, CREDIT_STEP: int(steps[0])}
         if self.pay == "proxy":
-            self.credit.fit_pending()
-            reward = float(self.credit.rewards_at(steps)[0])
+            reward = float(self._recorder.proxy_rewards(steps)[0])
         return observation, reward, terminated, truncated, info
 
 
@@ -95,7 +94,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
     """
 
     def __init__(self, env: VectorEnv, credit: CreditAssigner, pay: Pay = "proxy", score: str | None = None):
-        """Wrap a vector environment. The arguments are those of `Credit`. Raises `LareError` if it has no autoreset mode, and as there."""
+        """Wrap a vector environment. Arguments and errors are those of `Credit`. It must have an autoreset mode."""
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, credit=credit, pay=pay, score=score)
         VectorWrapper.__init__(self, env)
         check_pay(pay)
@@ -130,14 +129,12 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         observation, reward, terminated, truncated, infos = self.env.step(deepcopy(actions))
         done = np.asarray(terminated | truncated)
         valid = ~self._done if self.mode == AutoresetMode.NEXT_STEP else np.ones(self.num_envs, bool)
-        last_infos, credit_reward = None, np.asarray(reward, float)
+        credit_reward, env_infos = np.asarray(reward, float), []
         if self.credit.config.groups or self.score is not None:
-            last_infos = [self._select_info(infos, done, env_index) for env_index in range(self.num_envs)]
-            if self.score is not None:
-                scores = [
-                    read_score(info, self.score) if end else 0 for info, end in zip(last_infos, done, strict=True)
-                ]
-                credit_reward = np.array(scores, float)
+            env_infos = [self._select_info(infos, done, env_index) for env_index in range(self.num_envs)]
+        if self.score is not None:
+            ends = zip(env_infos, done, strict=True)
+            credit_reward = np.array([read_score(info, self.score) if end else 0.0 for info, end in ends])
         steps = self._recorder.add(
             self._observation,
             actions,
@@ -146,7 +143,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
             terminated,
             truncated,
             valid=valid,
-            infos=last_infos,
+            infos=env_infos,
         )
         self._observation, self._done = deepcopy(observation), done.copy()
         infos = {
@@ -157,9 +154,8 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
             f"_{CREDIT_STEP}": valid,
         }
         if self.pay == "proxy":
-            self.credit.fit_pending()
             dtype = np.result_type(reward, np.float32)  # the environment's rewards may be whole numbers
-            reward = self.credit.rewards_at(steps).astype(dtype)
+            reward = self._recorder.proxy_rewards(steps).astype(dtype)
         return observation, reward, terminated, truncated, infos
 
     def _next_observation(self, observation: Any, infos: Mapping[str, Any], done: Bool[np.ndarray, " envs"]) -> Any:

@@ -16,8 +16,8 @@ from lare_rl.integrations.recorder import CREDIT_STEP, Pay, StepRecorder, check_
 
 try:
     from pettingzoo.utils.wrappers import BaseParallelWrapper
-except ModuleNotFoundError as error:
-    raise missing_extra_error("lare_rl.integrations.pettingzoo", "pettingzoo") from error
+except ImportError as missing:
+    raise missing_extra_error("lare_rl.integrations.pettingzoo", "pettingzoo") from missing
 
 __all__ = ["CreditParallel"]
 
@@ -95,8 +95,7 @@ class CreditParallel(BaseParallelWrapper):
         for agent, index in acting.items():
             infos[agent] = {TRUE_REWARD: float(reward[index]), **infos.get(agent, {}), CREDIT_STEP: int(steps[0])}
         if self.pay == "proxy":
-            self.credit.fit_pending()
-            r_hat = self.credit.rewards_at(steps).reshape(-1)
+            r_hat = self._recorder.proxy_rewards(steps).reshape(-1)
             rewards = {agent: float(r_hat[acting[agent]]) if agent in acting else 0.0 for agent in rewards}
         return observations, rewards, terminated, truncated, infos
 

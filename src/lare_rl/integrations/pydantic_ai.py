@@ -16,13 +16,13 @@ from lare_rl.llm.prompts import Message
 try:
     from pydantic_ai import Agent
     from pydantic_ai.messages import ModelRequest, ModelResponse, SystemPromptPart, TextPart, UserPromptPart
-except ImportError:
-    raise missing_extra_error("lare_rl.integrations.pydantic_ai", "pydantic-ai") from None
+except ImportError as missing:
+    raise missing_extra_error("lare_rl.integrations.pydantic_ai", "pydantic-ai") from missing
 
 __all__ = ["pydantic_ai_model"]
 
 _LOCK = threading.Lock()
-"""Held while the loop is started, because `cache` may call a function several times at once."""
+"""Held while the loop is started: without it, `cache` may call `_event_loop` several times at once."""
 
 
 def pydantic_ai_model(model: Any) -> FunctionModel:
@@ -44,7 +44,8 @@ def pydantic_ai_model(model: Any) -> FunctionModel:
     def ask(messages: list[Message]) -> str:
         history = [_convert(message) for message in messages[:-1]]
         run = agent.run(messages[-1]["content"], message_history=history)
-        future = asyncio.run_coroutine_threadsafe(run, _event_loop())
+        with _LOCK:
+            future = asyncio.run_coroutine_threadsafe(run, _event_loop())
         try:
             return future.result().output
         finally:
@@ -53,14 +54,9 @@ def pydantic_ai_model(model: Any) -> FunctionModel:
     return FunctionModel(ask, str(getattr(agent.model, "model_name", agent.model)))
 
 
+@cache
 def _event_loop() -> asyncio.AbstractEventLoop:
     """Return the loop of all requests, because connections belong to a loop. In a notebook, the main thread runs another."""
-    with _LOCK:
-        return _start_loop()
-
-
-@cache
-def _start_loop() -> asyncio.AbstractEventLoop:
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, daemon=True).start()
     return loop

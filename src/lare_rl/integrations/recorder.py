@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import gymnasium
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.assigner.space_layout import make_layout
@@ -21,11 +21,7 @@ Pay = Literal["proxy", "environment"]
 
 
 class StepRecorder:
-    """Shows steps to an assigner, in the form that it takes.
-
-    If the environment and the assigner have the same spaces, values are passed on unchanged. If the assigner only has the sizes of
-    observations and actions, from a task file, values become rows of numbers.
-    """
+    """Shows steps to an assigner. They become rows of numbers if it only has the sizes of observations and actions, from a task file."""
 
     def __init__(
         self,
@@ -59,20 +55,33 @@ class StepRecorder:
         observation: Any,
         action: Any,
         next_observation: Any,
-        *results: Any,
+        reward: Any,
+        terminated: Any,
+        truncated: Any,
+        *,
+        infos: Sequence[Mapping[str, Any]],
         valid: Bool[np.ndarray, " environments"] | None = None,
-        infos: Sequence[Mapping[str, Any]] | None = None,
     ) -> Int[np.ndarray, " environments"]:
-        """Show one step of each environment, and return their numbers.
-
-        `results` are the rewards and the two flags of the steps, as in `CreditAssigner.add`. `infos` have the groups of episodes.
-        """
-        steps = []
-        for name, value in (("observation", observation), ("action", action), ("next_observation", next_observation)):
+        """Show one step of each environment, and return their numbers: see `CreditAssigner.add`. `infos` have the groups."""
+        steps = {"observation": observation, "action": action, "next_observation": next_observation}
+        for name, value in steps.items():
             kind = name.removeprefix("next_")
-            steps.append(value if self._same_space[kind] else self.layouts[kind].rows(value, name))
-        group = None if infos is None else self.read_groups(infos)
-        return self.credit.add(*steps, *results, env_ids=self.env_ids, valid=valid, group=group)
+            if not self._same_space[kind]:
+                steps[name] = self.layouts[kind].rows(value, name)
+        return self.credit.add(
+            **steps,
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            env_ids=self.env_ids,
+            valid=valid,
+            group=self.read_groups(infos),
+        )
+
+    def proxy_rewards(self, steps: Int[np.ndarray, " environments"]) -> Float[np.ndarray, "environments *agents"]:
+        """Return r_hat of these steps, after pending updates of the decoder."""
+        self.credit.fit_pending()
+        return self.credit.rewards_at(steps)
 
     def read_groups(self, infos: Sequence[Mapping[str, Any]]) -> list[Any] | None:
         """Return the groups of episodes from the infos of their steps, None where a step has none. None without groups."""

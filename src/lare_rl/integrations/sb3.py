@@ -23,8 +23,8 @@ from lare_rl.integrations.recorder import StepRecorder, check_assigner, check_ca
 
 try:
     import stable_baselines3
-except ImportError:
-    raise missing_extra_error("lare_rl.integrations.sb3", "sb3") from None
+except ImportError as missing:
+    raise missing_extra_error("lare_rl.integrations.sb3", "sb3") from missing
 if [int(number) for number in re.findall(r"\d+", stable_baselines3.__version__)[:2]] < [2, 9]:
     raise LareError(
         f"lare_rl.integrations.sb3 needs stable-baselines3 2.9 or later, and {stable_baselines3.__version__} is installed: "
@@ -194,20 +194,17 @@ class CreditCallback(BaseCallback):
         vars(self.model.rollout_buffer).pop("compute_returns_and_advantage", None)  # pyright: ignore[reportAttributeAccessIssue]
 
     def _on_step(self) -> bool:
-        normalize, values = self.model.get_vec_normalize_env(), self.locals
+        normalize, values, done = self.model.get_vec_normalize_env(), self.locals, self.locals["dones"]
         reward = values["rewards"] if normalize is None else normalize.get_original_reward()
         observation = self._original_observation(values["new_obs"])
         next_observation = deepcopy(observation)
-        for env_index in np.flatnonzero(values["dones"]):
+        for env_index in np.flatnonzero(done):
             last = values["infos"][env_index].get("terminal_observation")
             if last is not None:
-                last = last if normalize is None else normalize.unnormalize_obs(last)
-                _set_row(next_observation, env_index, last)
+                _set_row(next_observation, env_index, last if normalize is None else normalize.unnormalize_obs(last))
         env_action = values.get("clipped_actions", values["actions"])  # MaskablePPO does not clip actions
-        done = values["dones"]
-        results = reward, done, np.zeros_like(done)
-        steps = self._recorder.add(self._observation, env_action, next_observation, *results, infos=values["infos"])
-        self.steps.append(steps)
+        steps = self._observation, env_action, next_observation
+        self.steps.append(self._recorder.add(*steps, reward, done, np.zeros_like(done), infos=values["infos"]))
         self._observation = observation
         # The algorithm itself writes this array into its buffer, and adds gamma V(s') to it at time limits.
         values["rewards"][:] = 0

@@ -20,8 +20,8 @@ try:
     import torch
     from tensordict import TensorDictBase
     from torchrl.envs.transforms import Transform
-except ModuleNotFoundError as error:
-    raise missing_extra_error("lare_rl.integrations.torchrl", "torchrl") from error
+except ImportError as missing:
+    raise missing_extra_error("lare_rl.integrations.torchrl", "torchrl") from missing
 
 __all__ = ["CREDIT_STEP", "REWARD", "CreditTransform"]
 

@@ -18,7 +18,7 @@ from lare_rl.util.npz import open_npz
 __all__ = ["FlatLog", "ListLog", "NpzLog", "read_npz"]
 
 D4RL_NAMES = {"terminals": "terminations", "timeouts": "truncations"}
-"""Names of flags in D4RL's data sets, and the names here."""
+"""From the names of flags in D4RL to those of `parse_episode`."""
 MAX_EPISODE_BYTES = 8 << 30
 """The largest size of an episode in memory. A few compressed bytes can unpack to gigabytes."""
 
@@ -69,7 +69,7 @@ def read_npz(file: Path) -> dict[str, np.ndarray]:
 
 
 class ListLog(ArrayLog):
-    """An iterable of mappings, which can be iterated more than once. One episode is read at a time."""
+    """An iterable of mappings that can be iterated more than once. One episode is read at a time."""
 
     name = "the list of episodes"
 

@@ -36,7 +36,7 @@ class LoggedEpisode:
     complete: bool
     """Whether the episode was played to its end. Only then is its return known."""
     group: GroupName | None
-    """The group of the episode, such as its map. None if the log does not tell it."""
+    """The group of the episode, such as its map. None if the log has none."""
     contents: Any = field(repr=False)
     """The episode as it was read, to write it again: a mapping of arrays, or a table."""
 
@@ -67,7 +67,7 @@ def infer_layout(name: str, values: Mapping[str, Any], role: TaskSpec | None) ->
     """Infer the layout of a log without spaces from its first episode.
 
     Args:
-        role: the task of the log, which has the sizes of one-hot observations and actions, and the time limit.
+        role: the task of the log: the sizes of one-hot observations and actions, and the time limit.
 
     Raises:
         LareError: actions or observations are whole numbers, and the number of choices is unknown.
@@ -139,24 +139,15 @@ def parse_episode(name: str, values: Mapping[str, Any], layout: LogLayout, conte
 
 
 def _rows(where: str, values: Any, layout: SpaceLayout) -> Float[np.ndarray, "steps size"]:
-    for leaf in _leaves(values):
-        check_numbers(to_array(leaf, where), where)
     rows = layout.rows(values, where)
+    check_numbers(rows, where)
     if rows.ndim != 2:
         raise LareError(f"{where} must have rows of {layout.size} numbers, and its shape is {rows.shape}")
     return rows
 
 
-def _leaves(values: Any) -> list[Any]:
-    """Return the arrays of a nested observation."""
-    if isinstance(values, dict | tuple):
-        children = values.values() if isinstance(values, dict) else values
-        return [leaf for child in children for leaf in _leaves(child)]
-    return [values]
-
-
 def _original_reward(name: str, values: Mapping[str, Any], n_steps: int) -> Float[np.ndarray, " steps"]:
-    """Return the rewards of an episode, or those before it was relabelled."""
+    """Return the rewards of an episode: those before it was relabelled, if it was."""
     key = next((key for key in ("paid", "score", "rewards") if key in values), None)
     if key is None:
         raise LareError(f"{name} has no rewards and no score: an episode needs observations, actions, and one of these")

@@ -1,4 +1,4 @@
-"""What a log is in any format, and how one is written completely or not at all."""
+"""A log in any format, and output that is written completely or not at all."""
 
 import contextlib
 import shutil

@@ -3,9 +3,11 @@
 Each format is imported when it is needed, because the libraries of most formats are optional.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from lare_rl.errors import LareError, short_repr
 from lare_rl.logs.log import Log
@@ -18,8 +20,7 @@ def open_log(source: Any, task: TaskSpec | None = None) -> Log:
     """Open a log by its path, its Minari id, or as an object.
 
     Args:
-        source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
-            flat arrays by name (as in D4RL), or a list of episodes, each a mapping of arrays.
+        source: as in `relabel`. Flat arrays may have D4RL's names.
         task: has the time limit, the number of choices if observations or actions are whole numbers, and the key of groups in
             the infos of a Minari data set.
 
@@ -36,7 +37,7 @@ def open_log(source: Any, task: TaskSpec | None = None) -> Log:
         from lare_rl.logs.minari import MinariLog
 
         return MinariLog(source, role)
-    if isinstance(source, Iterable) and not isinstance(source, bytes):
+    if np.iterable(source) and not isinstance(source, bytes):
         from lare_rl.logs.arrays import FlatLog, ListLog
 
         return FlatLog(source, role) if isinstance(source, Mapping) else ListLog(source, role)

@@ -18,7 +18,7 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS, Reward
 from lare_rl.credit.prequential import LITTLE_R2, MIN_R2_EPISODES
 from lare_rl.envs.load import resolve_task
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, check_count
 from lare_rl.latent.function import LatentFunction
 from lare_rl.logs.episode import RelabelledEpisode
 from lare_rl.logs.log import Log, batch_by_steps
@@ -133,7 +133,7 @@ def relabel(
 
     Args:
         source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
-            flat arrays by name, or a list of mappings of arrays (docs/reference/logs.md).
+            flat arrays by name, or a list of episodes, each a mapping of arrays (docs/reference/logs.md).
         out: the path to write, or the id of the new Minari data set. It is written completely or not at all.
         method: how credit is assigned; the default is `lare-bayes` with a `phi`, and `bayes` without.
         phi: the latent function; it needs its `task`.
@@ -148,12 +148,16 @@ def relabel(
             uses all episodes, other fits use the last episodes that fit into it.
         seed: seed of the choice of held-out episodes and of the decoder's initial weights.
         overwrite: whether `out` is replaced if it exists.
-        listener: is told of each episode that is read, in both passes.
+        listener: is called after each episode, in both passes.
 
     Raises:
         LareError: the log is damaged or empty, `out` cannot be written or exists, or method, function and task do not fit together.
     """
-    _check_numbers(hold_out, memory, updates)
+    check_count("updates", updates)
+    if not 0 <= hold_out <= 0.9:
+        raise LareError(f"hold_out = {hold_out} must be between 0 and 0.9")
+    if not 0 < memory <= 1e6:
+        raise LareError(f"memory = {memory} must be positive, and at most 1e6 (GiB)")
     task = None if task is None else resolve_task(task, playable=False)
     log = open_log(source, task)
     log.check_output(out, overwrite)
@@ -161,7 +165,7 @@ def relabel(
         raise LareError(
             f"{method} gives all steps of an episode the same reward, and needs no relabelling: compute it from the return"
         )
-    create = partial(
+    make_assigner = partial(
         CreditAssigner,
         method,
         phi,
@@ -174,7 +178,8 @@ def relabel(
         forget=False,
         groups=log.layout.has_groups,
     )
-    credit = create(capacity=max(MIN_CAPACITY, int(memory * 2**30 / create(capacity=1).store.bytes_per_step)))
+    bytes_per_step = make_assigner(capacity=1).store.bytes_per_step
+    credit = make_assigner(capacity=max(MIN_CAPACITY, int(memory * 2**30 / bytes_per_step)))
     size = _fit(credit, log, hold_out_flags(hold_out, seed), updates, listener)
     explanation, counts = tuple(credit.explanation()), _Counts()
     episodes = _compute_rewards(credit, log, hold_out_flags(hold_out, seed), size, counts, listener)
@@ -198,19 +203,10 @@ def relabel(
     )
 
 
-def _check_numbers(hold_out: float, memory: float, updates: int) -> None:
-    if not 0 <= hold_out <= 0.9:
-        raise LareError(f"hold_out = {hold_out} must be between 0 and 0.9")
-    if not 0 < memory <= 1e6:
-        raise LareError(f"memory = {memory} must be positive, and at most 1e6 (GiB)")
-    if updates < 1:
-        raise LareError(f"updates = {updates} must be at least 1")
-
-
 def hold_out_flags(share: float, seed: int) -> Iterator[bool]:
     """Yield without end whether the next complete episode is held out.
 
-    After each block of `BLOCK_EPISODES` episodes, `share` of all so far are held out, rounded down. Which ones of a block is random.
+    After each block of `BLOCK_EPISODES` episodes, `share` of all so far are held out, rounded down. Those of a block are random.
     """
     block = 0
     while True:

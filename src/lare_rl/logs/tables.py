@@ -89,12 +89,8 @@ class ParquetLog(TableLog):
                 with pq.ParquetFile(file) as reader:
                     schema = schema or reader.schema_arrow
                     if reader.schema_arrow != schema:
-                        texts = (
-                            fields.remove_metadata().to_string().splitlines()
-                            for fields in (schema, reader.schema_arrow)
-                        )
-                        first = next((b or a for a, b in itertools.zip_longest(*texts) if a != b), "a column")
-                        raise LareError(f"{file} has other columns or types than {files[0]}, first {first}")
+                        column = _first_difference(schema, reader.schema_arrow)
+                        raise LareError(f"{file} has other columns or types than {files[0]}, first {column}")
                     yield from reader.iter_batches(batch_rows(schema))
             except (OSError, pa.ArrowException, NotImplementedError) as error:
                 raise LareError(f"{file} is not a Parquet file, or damaged: {short_repr(error)}") from error
@@ -142,6 +138,14 @@ def _check_columns(path: Path, schema: pa.Schema) -> None:
     ids = data_type.value_type if pa.types.is_dictionary(data_type) else data_type
     if not (pa.types.is_integer(ids) or _is_text(ids)):
         raise LareError(f"{path}: the column episode must be whole numbers or strings, and is {data_type}")
+
+
+def _first_difference(expected: pa.Schema, actual: pa.Schema) -> str:
+    """Return the name and type of the first column that two schemas do not share."""
+    columns = itertools.zip_longest(
+        *(schema.remove_metadata().to_string().splitlines() for schema in (expected, actual))
+    )
+    return next((new or old for old, new in columns if old != new), "a column")
 
 
 def _rows_are_episodes(schema: pa.Schema) -> bool:

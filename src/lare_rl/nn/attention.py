@@ -1,4 +1,4 @@
-"""Attention over an axis and layer normalisation, which AREL and STAS share."""
+"""Attention over an axis, and layer normalisation."""
 
 from collections.abc import Callable
 

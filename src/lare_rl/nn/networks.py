@@ -1,4 +1,4 @@
-"""The network shapes that actors, critics and decoders share, and updates of their parameters."""
+"""Networks of actors, critics and decoders, and updates of their parameters."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
@@ -81,7 +81,7 @@ class MLP(eqx.Module):
 class GRU(eqx.Module):
     """A gated recurrent unit (Cho et al., 2014), as in cuDNN and PyTorch.
 
-        z = s(x U_z + h W_z)    r = s(x U_r + h W_r)    n = tanh(x U_n + r * (h W_n))    h' = (1 - z) n + z h
+        z = sigmoid(x U_z + h W_z)    r = sigmoid(x U_r + h W_r)    n = tanh(x U_n + r * (h W_n))    h' = (1 - z) n + z h
 
     Each of the six products has a bias.
     """
@@ -97,7 +97,7 @@ class GRU(eqx.Module):
         self.hidden_projection = Linear(size, 3 * size, key=hidden_key)
 
     def __call__(
-        self, projected: Float[Array, "*batch three"], h: Float[Array, "*batch size"]
+        self, projected: Float[Array, "*batch three_sizes"], h: Float[Array, "*batch size"]
     ) -> Float[Array, "*batch size"]:
         """Return h'. `projected` is x U, which a caller computes for all steps at once."""
         z, r, n = jnp.split(projected, 3, axis=-1)

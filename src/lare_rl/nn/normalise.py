@@ -1,4 +1,4 @@
-"""Running statistics in the training state, by which features and returns of any scale are learned alike."""
+"""Running statistics, by which features and returns are normalised."""
 
 from typing import Any, NamedTuple
 
@@ -45,13 +45,9 @@ def update_mean_std(
     statistics: RunningMeanStd, rows: Float[Array, "batch features"], mask: Bool[Array, " batch"] | None = None
 ) -> RunningMeanStd:
     """Add a batch of rows. Rows where `mask` is false are ignored."""
-    if mask is None:
-        n_new, mean = rows.shape[0], jnp.mean(rows, axis=0)
-        batch_squares = jnp.sum((rows - mean) ** 2, axis=0)
-    else:
-        n_new = jnp.sum(mask)
-        mean = jnp.sum(rows, axis=0, where=mask[:, None]) / jnp.maximum(n_new, 1)
-        batch_squares = jnp.sum((rows - mean) ** 2, axis=0, where=mask[:, None])
+    n_new, where = (len(rows), None) if mask is None else (jnp.sum(mask), mask[:, None])
+    mean = jnp.sum(rows, axis=0, where=where) / jnp.maximum(n_new, 1)
+    batch_squares = jnp.sum((rows - mean) ** 2, axis=0, where=where)
     n_rows, merged, difference, fraction = merge_means(statistics.n_rows, statistics.mean, n_new, mean)
     between = difference**2 * statistics.n_rows * fraction
     return RunningMeanStd(n_rows, merged, statistics.sum_squares + batch_squares + between)
@@ -106,14 +102,14 @@ def update_scale(scale: Scale, values: Float[Array, " batch"], mask: Bool[Array,
     """Add the values where `mask` is true."""
     n_episodes = scale.n_episodes + jnp.sum(mask)
     excess = jnp.sum(jnp.where(mask, values**2 - scale.mean_square, 0))
-    lowest = jnp.min(values, where=mask, initial=jnp.inf)
-    highest = jnp.max(values, where=mask, initial=-jnp.inf)
     had_episodes, has_episodes = scale.n_episodes > 0, n_episodes > 0
+    lowest = jnp.min(values, where=mask, initial=jnp.where(had_episodes, scale.lowest, jnp.inf))
+    highest = jnp.max(values, where=mask, initial=jnp.where(had_episodes, scale.highest, -jnp.inf))
     return Scale(
         n_episodes=n_episodes,
         mean_square=scale.mean_square + excess / jnp.maximum(n_episodes, 1),
-        lowest=jnp.where(has_episodes, jnp.where(had_episodes, jnp.minimum(scale.lowest, lowest), lowest), 0),
-        highest=jnp.where(has_episodes, jnp.where(had_episodes, jnp.maximum(scale.highest, highest), highest), 0),
+        lowest=jnp.where(has_episodes, lowest, 0),
+        highest=jnp.where(has_episodes, highest, 0),
     )
 
 
