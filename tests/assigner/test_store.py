@@ -64,7 +64,7 @@ def test_rows_and_add_refuse():
     assert store.rows(np.zeros(0, np.int64)).tolist() == []
     with pytest.raises(LareError, match=r"6 .*capacity = 5"):
         store.add(6)
-    assert store.n_added == 8
+    assert store.add(5).tolist() == [8, 9, 10, 11, 12]
 
 
 def test_lengths_of_a_running_episode_is_the_mean():

@@ -94,6 +94,7 @@ def test_integers_never_fail(xp):
     expressions = {
         "(observation[:, :1] > 0).astype(int) // 0": 0,
         "np.array([5, 7])[(observation[:, :1] * 0 + 9).astype(int)]": 7,  # beyond the end: the last entry
+        "np.array([5, 7])[(observation[:, :1] * 0 - 9).astype(int)]": 5,  # before the beginning: the first entry
         "(observation[:, :1] * 0 + 1e20).astype(int)": 2**31 - 128,
         "np.sum(observation[:, :2] > -99, axis=1, keepdims=True)": 2,
         "(observation[:, :1] * 2).astype(int) ** (action - 2).astype(int)": 1,
