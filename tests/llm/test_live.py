@@ -262,7 +262,7 @@ def test_slow_answer_ends_with_the_time_of_the_design(start, answer):
     messages = []
     server, model, _ = start(answer, budget=Budget(seconds=0.4), on_message=messages.append)
     began = time.monotonic()
-    with pytest.raises(BudgetExceededError, match="TimeoutError"):
+    with pytest.raises(BudgetExceededError, match="TimeoutError|ReadTimeout"):
         model.reply(REQUEST, 0)
     assert "0 s at most" in messages[0]
     assert time.monotonic() - began < 5

@@ -3,7 +3,7 @@
 Each format is imported when it is needed, because the libraries of most formats are optional.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ def open_log(source: Any, task: TaskSpec | None = None) -> Log:
         from lare_rl.logs.minari import MinariLog
 
         return MinariLog(source, role)
-    if np.iterable(source) and not isinstance(source, bytes):
+    if isinstance(source, Iterable) and not isinstance(source, bytes | np.ndarray):
         from lare_rl.logs.arrays import FlatLog, ListLog
 
         return FlatLog(source, role) if isinstance(source, Mapping) else ListLog(source, role)
