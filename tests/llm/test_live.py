@@ -348,7 +348,7 @@ def test_pauses_count_as_waiting(start):
     _, model, pauses = start(
         refuse(429, Retry_After="999999999"), budget=Budget(seconds=150.0), on_message=messages.append
     )
-    with pytest.raises(BudgetExceededError, match="no time is left.*of 150 s"):
+    with pytest.raises(BudgetExceededError, match=r"no time is left.*of 150 s"):
         model.reply(REQUEST, 0)
     assert pauses == [60.0, 60.0]
     assert ("120 s at most" in messages[0], messages[1][-6:]) == (True, "60.0 s")

@@ -13,8 +13,6 @@ from lare_rl.util.findings import format_for_reader
 __all__ = ["Budget", "BudgetExceededError", "max_request_tokens"]
 
 _MAX_REPORTED_TOKENS = 1 << 40  # a server that reports more is wrong
-_REPLY_TIMEOUT_S = 120.0
-_REPLY_TIMEOUT_FRACTION = 1 / 8
 
 
 class BudgetExceededError(LareError):
@@ -56,7 +54,7 @@ class Budget:
     @property
     def reply_timeout_s(self) -> float:
         """The longest time for the next reply: the larger of 120 s and an eighth of `seconds`, but at most the time left."""
-        return min(max(_REPLY_TIMEOUT_S, _REPLY_TIMEOUT_FRACTION * self.seconds), self.seconds_left)
+        return min(max(120.0, self.seconds / 8), self.seconds_left)
 
     @property
     def seconds_left(self) -> float:
@@ -72,8 +70,9 @@ class Budget:
         self.seconds_used += seconds
 
     @contextlib.contextmanager
-    def count_time(self) -> Iterator[None]:
-        """Count the time of the block."""
+    def count_request(self) -> Iterator[None]:
+        """Count a request, and the time of the block."""
+        self.requests_used += 1
         start = time.monotonic()
         try:
             yield
@@ -82,9 +81,8 @@ class Budget:
 
     def timeout_text(self) -> str:
         """Return the longest time for the next reply in words."""
-        return (
-            f"{self.reply_timeout_s:.0f} s at most ({format_for_reader(self.seconds_left, 'seconds')} are left for all)"
-        )
+        left = format_for_reader(self.seconds_left, "seconds")
+        return f"{self.reply_timeout_s:.0f} s at most ({left} are left for all)"
 
     def count_reply(self, usage: Any, messages: Sequence[Message], reply_bound: int) -> None:
         """Add the tokens of a request and its reply.
