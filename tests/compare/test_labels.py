@@ -79,7 +79,7 @@ def test_directories_on_two_drives(make_run):
     for drive in "CD":
         directory = SimpleNamespace(resolve=partial(PureWindowsPath, f"{drive}:/runs/new"))
         runs.append(replace(make_run(drive, [1.0]), directory=directory))
-    assert list(label_runs(runs)) == ["dense, C:\\", "dense, D:\\"]
+    assert list(label_runs(runs)) == ["dense, C:", "dense, D:"]
 
 
 def test_settings_without_effect_do_not_split_labels(make_run):

@@ -134,7 +134,7 @@ def _split_by_directory(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]
 
     The labels end in the shortest part of the paths by which no two such runs have the same label.
     """
-    paths = [run.directory.resolve().parts for run in runs]
+    paths = [run.directory.resolve().as_posix().split("/") for run in runs]
     levels = enumerate(zip(*paths, strict=False))
     n_common = next((level for level, names in levels if len(set(names)) > 1), min(map(len, paths)) - 1)
     tails = [path[n_common:] for path in paths]

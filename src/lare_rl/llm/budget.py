@@ -81,8 +81,8 @@ class Budget:
 
     def timeout_text(self) -> str:
         """Return the longest time for the next reply in words."""
-        left = format_for_reader(self.seconds_left, "seconds")
-        return f"{self.reply_timeout_s:.0f} s at most ({left} are left for all)"
+        remaining = format_for_reader(self.seconds_left, "seconds")
+        return f"{self.reply_timeout_s:.0f} s at most ({remaining} are left for all)"
 
     def count_reply(self, usage: Any, messages: Sequence[Message], reply_bound: int) -> None:
         """Add the tokens of a request and its reply.
