@@ -101,6 +101,7 @@ CALLS = {
     "lare_rl.reflect(phi, 7, None)": "TaskSpec",
     "lare_rl.reflect(phi, task, lambda messages, number: '', 1.5)": "rounds = 1.5",
     "lare_rl.pure_credit('bayes', observation_size='2', **sizes)": "observation_size = '2'",
+    "lare_rl.pure_credit('rrdu', observation_size=2, fit_updates=-1, **sizes)": "fit_updates = -1",
     "lare_rl.pure_credit('bayes', observation_size=2, scored_observation='now', **sizes)": "'before', 'after' or 'both'",
     "lare_rl.pure_credit('bayes', observation_size=2, settings={'score': 'sum'}, **sizes)": "lare_rl.CreditSettings",
     "lare_rl.pure_credit('lare-bayes', 'phi.py', observation_size=2, **sizes)": "lare_rl.load_function",
@@ -117,16 +118,24 @@ CALLS = {
     "lare_rl.relabel('none', 'out', updates=2.5)": "updates = 2.5",
     "lare_rl.relabel('none', 'out', task=7)": "TaskSpec",
     "lare_rl.logged_steps('none', 7)": "TaskSpec",
+    "lare_rl.logged_steps('none', task, 0)": "count = 0",
+    "lare_rl.relabel('none', 'out', hold_out='0.1')": "hold_out = '0.1'",
+    "lare_rl.relabel('none', 'out', memory='1')": "memory = '1'",
+    "lare_rl.CreditAssigner(3)": "no method 3",
     "Method('mine', '', '', inputs=('observation',))": "method mine: ('observation',) is no InputNames: write",
     "Method('mine', '', '', fit='all steps')": "method mine: 'all steps' is no Fit: write Fit.ALL_STEPS",
     "Method('mine', '', '', decoder=None)": "None is no str: write",
     "InputNames('action')": "a tuple of names",
     "InputNames(5)": "a tuple of names",
+    "InputNames(())": "a tuple of names",
+    "InputNames(('action',), ())": "a tuple of names",
     "Decoder('mine', 'mine:init', settings='hidden')": "a set of names",
+    "Decoder('mine', 'mine:init', settings=5)": "a set of names",
 }
 """Bad calls, and what the message must contain."""
 
 GOOD_CALLS = {
+    "lare_rl.TurnCredit(np.float32(0.5)).lambda_ == 0.5": "True",
     "phi([0.5, 0], [0.5]).shape": "(2,)",
     "InputNames(['action']).names": "('action',)",
     "InputNames(('next_observation', 'scored_observation')).resolve('after')": "('next_observation',)",

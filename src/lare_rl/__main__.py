@@ -10,7 +10,8 @@ def main() -> None:
     try:
         from lare_rl import cli
     except LareError as error:
-        sys.stderr.write(f"lare-rl: {error}\n")
+        if sys.stderr is not None:  # it was closed by the caller
+            sys.stderr.write(f"lare-rl: {error}\n")
         sys.exit(error.status)
     cli.main()
 

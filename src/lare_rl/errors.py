@@ -87,7 +87,7 @@ def find_named(kind: str, kinds: str, name: str, values: Mapping[str, T]) -> T:
     """Return the value of a name. Raise `LareError` if no value has it: the message lists all names of the `kinds`."""
     if name in values:
         return values[name]
-    raise LareError(f"no {kind} {name!r}{did_you_mean(name, values)}; the {kinds} are {', '.join(values)}")
+    raise LareError(f"no {kind} {name!r}{did_you_mean(str(name), values)}; the {kinds} are {', '.join(values)}")
 
 
 def check_count(name: str, value: Any) -> int:

@@ -1,4 +1,7 @@
-from pathlib import Path
+from dataclasses import replace
+from functools import partial
+from pathlib import Path, PureWindowsPath
+from types import SimpleNamespace
 
 from helpers.toy_envs import toy_spec
 from lare_rl.compare.collect import collect_results
@@ -69,6 +72,14 @@ def test_directories_split_labels(make_run):
     assert sizes([old, make_run("old", [1.0], "Reacher-v4")]) == {"dense": 2}
     sweeps = [make_run(f"{sweep}/dense-td3", [1.0]) for sweep in ("one", "two")]
     assert list(label_runs(sweeps)) == ["dense, one", "dense, two"]
+
+
+def test_directories_on_two_drives(make_run):
+    runs = []
+    for drive in "CD":
+        directory = SimpleNamespace(resolve=partial(PureWindowsPath, f"{drive}:/runs/new"))
+        runs.append(replace(make_run(drive, [1.0]), directory=directory))
+    assert list(label_runs(runs)) == ["dense, C:", "dense, D:"]
 
 
 def test_settings_without_effect_do_not_split_labels(make_run):

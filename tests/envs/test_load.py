@@ -126,7 +126,8 @@ def test_teams_inherit_shared_keys(spec_file, tmp_path):
         "arguments = { n = 3 }\n"
     )
     (tmp_path / "child.toml").write_text('like = "both.toml"\nteams = ["chase.toml"]\narguments = { n = 4 }\n')
-    for name, n in (("both", 3), ("child", 4)):
+    (tmp_path / "heir.toml").write_text('like = "both.toml"\narguments = { n = 5 }\n')
+    for name, n in (("both", 3), ("child", 4), ("heir", 5)):
         (role,) = read_task(tmp_path / f"{name}.toml").teams
         assert (role.environment, role.scored_observation, role.arguments, role.team) == (
             "x/y",

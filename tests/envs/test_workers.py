@@ -128,6 +128,7 @@ def test_error_of_an_environment(make_vec_env, fault, message):
     ("fault", "timeout", "message"),
     [
         ("dies", 60, "died: signal SIGKILL"),
+        ("is signalled", 60, "died: signal 40"),
         ("leaves", 60, "died: exit status 3"),
         ("hangs", 0.5, "did not reply for 0.5 s in step; if it needs longer, set timeout in the task file"),
     ],

@@ -262,7 +262,7 @@ def test_slow_answer_ends_with_the_time_of_the_design(start, answer):
     messages = []
     server, model, _ = start(answer, budget=Budget(seconds=0.4), on_message=messages.append)
     began = time.monotonic()
-    with pytest.raises(BudgetExceededError, match="TimeoutError|ReadTimeout"):
+    with pytest.raises(BudgetExceededError, match="Timeout"):
         model.reply(REQUEST, 0)
     assert "0 s at most" in messages[0]
     assert time.monotonic() - began < 5
@@ -319,7 +319,7 @@ def test_bytes_are_counted_without_usage(start_either, usage):
     _, model, _ = start_either(reply_with("grüße", usage=usage))
     model.reply(REQUEST, 0)
     assert (model.budget.tokens_in, model.budget.tokens_out) == (max_request_tokens(REQUEST), 7)
-    assert "counted as bytes" in model.budget.summary()
+    assert "bytes count" in model.budget.summary()
 
 
 def test_token_budget(start):
@@ -348,7 +348,7 @@ def test_pauses_count_as_waiting(start):
     _, model, pauses = start(
         refuse(429, Retry_After="999999999"), budget=Budget(seconds=150.0), on_message=messages.append
     )
-    with pytest.raises(BudgetExceededError, match="3 min"):
+    with pytest.raises(BudgetExceededError, match=r"no time is left.*of 150 s"):
         model.reply(REQUEST, 0)
     assert pauses == [60.0, 60.0]
     assert ("120 s at most" in messages[0], messages[1][-6:]) == (True, "60.0 s")

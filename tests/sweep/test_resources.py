@@ -34,12 +34,13 @@ def test_assign_cores():
         (2, 1.0, ["0", "1"]),
         (5, 0.5, ["0", "1", "2", "3", "0"]),
         (2, 0.0, ["", ""]),
+        (5, 1e-320, ["0", "1", "2", "3", "0"]),
     ],
 )
 def test_assign_accelerators(processes, accelerators, expected):
     variables = assign_accelerators(processes, accelerators, 4, {})
     assert visible(variables) == expected
-    is_shared = processes > 4 or accelerators == 0.5
+    is_shared = processes > 4 or accelerators in (0.5, 1e-320)
     assert all((process.get(resources.PREALLOCATE) == "false") == is_shared for process in variables)
 
 

@@ -109,3 +109,8 @@ def test_turn_phi_asks_a_model(monkeypatch, command, tmp_path, file):
         status, _, error = command("turn-phi", file, *options[:-1], target)
         assert (status, words in error) == (2, True)
     assert command("turn-credit", file, "--out", tmp_path / "c.jsonl", "--function", out)[::2] == (0, "")
+    reply, attempts = "no function", tmp_path / "turns.attempts.json"
+    monkeypatch.chdir(tmp_path)
+    status, _, error = command("turn-phi", file, *options[:-2])
+    assert (status, "attempts passed" in error, attempts.name in error) == (1, True, True)
+    assert attempts.read_text().count("no function") > 1

@@ -50,11 +50,11 @@ COMMANDS = {
 
 
 def main() -> None:
-    """Run `lare-rl`. A user's mistake is one line on stderr and exit status 2; --debug prints its traceback too."""
+    """Run `lare-rl`. A user's mistake is one line on stderr and the error's exit status; --debug prints its traceback too."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # it was closed by the caller
             stream = open(os.devnull, "w")  # noqa: SIM115 - it stays open
-            os.set_inheritable(stream.fileno(), True)
+            os.set_inheritable(stream.fileno(), True)  # for processes that are started
             setattr(sys, name, stream)
     for stream in (sys.stdout, sys.stderr):  # a character that the terminal cannot show must raise no error
         if isinstance(stream, io.TextIOWrapper):
@@ -79,6 +79,6 @@ def main() -> None:
         print_error(error)
         if isinstance(error, LareError):
             sys.exit(error.status)
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # it may be stdout that failed: Python would write to it again at exit
             discard_output(sys.stdout)
         sys.exit(2)

@@ -81,7 +81,7 @@ def design(
     model = live.open(model_name) if is_live else recorded_model(spec.name, kind, draw, path)
     outputs: dict[str, Any] = {"record": record, "on_message": print_progress}
     options: dict[str, Any] = {"candidates": candidates, "pre_verification": pre_verification, "steps": steps}
-    with _after_requests(spec, model, live):
+    with after_requests(spec.name, model, live):
         function = lare_rl.design(spec, kind, model, **options, **outputs)
         if reflect:
             function = lare_rl.reflect(function, spec, model, reflect, policy=play, **outputs)
@@ -92,8 +92,8 @@ def design(
 
 
 @contextmanager
-def _after_requests(spec: "TaskSpec", model: "Model", live: LiveOptions) -> Iterator[None]:
-    """Save the replies of a design that fails, because they were paid for. Print what a live model has cost."""
+def after_requests(name: str, model: "Model", live: LiveOptions) -> Iterator[None]:
+    """Save the replies of a design that fails, as NAME.attempts.json, because they were paid for. Print what a live model has cost."""
     from lare_rl.latent.design import DesignError
     from lare_rl.llm.live import LiveModel
 
@@ -101,7 +101,7 @@ def _after_requests(spec: "TaskSpec", model: "Model", live: LiveOptions) -> Iter
         yield
     except DesignError as error:
         print_error(error)
-        _save_attempts(error, find_free_path(Path(), f"{spec.name}.attempts", ".json"))
+        _save_attempts(error, find_free_path(Path(), f"{name}.attempts", ".json"))
         sys.exit(error.status)
     finally:
         if isinstance(model, LiveModel) and model.budget.requests_used:

@@ -6,8 +6,8 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare_rl.cli.design import check_function_files
-from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_messages, print_progress
+from lare_rl.cli.design import after_requests, check_function_files
+from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_messages
 from lare_rl.errors import LareError
 from lare_rl.util.files import check_new_path, write_bytes
 from lare_rl.util.sanitize import one_line
@@ -100,10 +100,8 @@ def turn_phi(
     out = check_function_files(out)
     record = None if out is None else out.with_suffix(".json")
     live_model = live.open(model)
-    try:
+    with after_requests("turns", live_model, live):
         designed = design_turn_phi(goal, descriptions, turns, live_model, record=record)
-    finally:
-        print_progress(f"{live_model.name}: {live_model.budget.summary(live.price)}")
     if out is None:
         print_line(designed.phi.source)
         return

@@ -3,7 +3,6 @@
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from lare_rl.compare.results import group_pairs
@@ -135,10 +134,10 @@ def _split_by_directory(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]
 
     The labels end in the shortest part of the paths by which no two such runs have the same label.
     """
-    paths = [run.directory.resolve() for run in runs]
-    common = Path(os.path.commonpath(paths))
-    root = common.parent if common in paths else common
-    tails = [str(path.relative_to(root)).split(os.sep) for path in paths]
+    paths = [run.directory.resolve().as_posix().split("/") for run in runs]
+    levels = enumerate(zip(*paths, strict=False))
+    n_common = next((level for level, names in levels if len(set(names)) > 1), min(map(len, paths)) - 1)
+    tails = [path[n_common:] for path in paths]
     for depth in range(max(map(len, tails)) + 1):
         names = [f"{label}, {os.sep.join(tail[:depth])}" if depth else label for tail in tails]
         groups = group_pairs(zip(names, runs, strict=True))

@@ -45,7 +45,7 @@ class Decoder:
     """The largest number of steps of a payment that it reads. None means any number."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.settings, str) or not set(self.settings) <= CreditSettings.model_fields.keys():
+        if not isinstance(self.settings, set | frozenset) or not self.settings <= CreditSettings.model_fields.keys():
             names = ", ".join(CreditSettings.model_fields)
             raise LareError(
                 f"decoder {self.name}: settings = {short_repr(self.settings)}: give a set of names of {names}"

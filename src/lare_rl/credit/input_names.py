@@ -34,11 +34,9 @@ class InputNames:
 
     def __post_init__(self) -> None:
         for field in ("names", "names_of_many_agents"):
-            names = getattr(self, field) or ()
-            if not isinstance(names, tuple | list) or not set(names) <= set(_NAMES):
-                raise LareError(
-                    f"the inputs of a decoder are a tuple of names among {', '.join(_NAMES)}, and was given {names!r}"
-                )
+            names = self.names if getattr(self, field) is None else getattr(self, field)
+            if not (isinstance(names, tuple | list) and names and set(names) <= set(_NAMES)):
+                raise LareError(f"the inputs of a decoder are a tuple of names of {', '.join(_NAMES)}, not {names!r}")
             if "history" in names[:-1]:
                 raise LareError(f"history must be the last input of a decoder, and the inputs are {names!r}")
             if isinstance(names, list):  # compiled functions need a tuple

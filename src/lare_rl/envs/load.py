@@ -1,6 +1,7 @@
 """Reads tasks from TOML files, and checks them against their environments."""
 
 import os.path
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -74,13 +75,13 @@ def check_environment(spec: TaskSpec) -> None:
         load_env_spec(spec.evaluation_task)
 
 
-def _read_values(task: str, ancestors: tuple[str, ...] = ()) -> dict[str, Any]:
+def _read_values(task: str, ancestors: tuple[str, ...] = (), overrides: Mapping[str, Any] = {}) -> dict[str, Any]:
     """Return the keys of a task file, with those of the task that `like` names, and with the keys of each team's file in `teams`."""
     try:
         values = rename_keys(read_toml(_read_file(task)))
     except ValueError as error:  # TOMLDecodeError, or a number with too many digits
         raise LareError(f"task {task!r} is not valid TOML: {error}") from error
-    like, teams, paths = values.pop("like", None), values.get("teams"), (*ancestors, os.path.realpath(task))
+    like, teams, paths = values.pop("like", None), values.pop("teams", None), (*ancestors, os.path.realpath(task))
 
     def is_valid(name: Any) -> bool:
         return isinstance(name, str) and "\0" not in name and os.path.realpath(resolve_path(task, name)) not in paths
@@ -89,8 +90,9 @@ def _read_values(task: str, ancestors: tuple[str, ...] = ()) -> dict[str, Any]:
         raise LareError(f"task {task!r}: like = {like!r} must be another task, without a cycle")
     if not (teams is None or (isinstance(teams, list) and all(map(is_valid, teams)))):
         raise LareError(f"task {task!r}: teams = {teams!r} must be a list of other tasks, without a cycle")
+    values |= overrides  # of the file whose `like` names this one: its teams inherit them too
     if like is not None:
-        values = _read_values(resolve_path(task, like), paths) | values
+        values = _read_values(resolve_path(task, like), paths, values)
     if teams is not None:
         shared = {key: values[key] for key in SHARED_KEYS if key in values}
         values["teams"] = [shared | _read_values(resolve_path(task, team), paths) for team in teams]

@@ -121,7 +121,8 @@ class Worker:
         status = self.process.returncode
         if status is None:
             return LareError(f"{self.label} closed its connection")
-        reason = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+        names = {number.value: number.name for number in signal.Signals}  # without most real-time signals
+        reason = f"signal {names.get(-status, -status)}" if status < 0 else f"exit status {status}"
         return LareError(f"{self.label} died: {reason}")
 
     def close_connection(self) -> None:

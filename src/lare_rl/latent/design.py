@@ -1,6 +1,7 @@
 """Candidates, combine, verify, correct: lines 2 and 3 of Algorithm 1 of the LaRe paper."""
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from lare_rl.llm.recording import Recorder
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec, require_role
 
-__all__ = ["Conversation", "DesignError", "check_recorded", "design", "examine_reply"]
+__all__ = ["Conversation", "DesignError", "check_recorded", "design", "examine_reply", "keep_replies"]
 
 
 class DesignError(LareError):
@@ -32,6 +33,18 @@ class DesignError(LareError):
     def __init__(self, message: str, recorder: Recorder, model: str, status: int = 1):
         super().__init__(message)
         self.recorder, self.model, self.status = recorder, model, status
+
+
+@contextlib.contextmanager
+def keep_replies(recorder: Recorder, model: Model) -> Iterator[None]:
+    """Raise a `DesignError` with the replies so far in place of another error, and if the user stops."""
+    try:
+        yield
+    except (LareError, KeyboardInterrupt) as error:
+        if isinstance(error, DesignError) or not recorder.exchanges:
+            raise
+        status = 2 if isinstance(error, LareError) else 130
+        raise DesignError(str(error) or "stopped", recorder, model.name, status) from error
 
 
 class Attempt(NamedTuple):
@@ -182,12 +195,7 @@ def design(
     path = None if record is None else Path(record)
     recorder = Recorder(task.name, kind, getattr(model, "temperature", None), path)
     conversation = Conversation(task, kind, model, recorder, on_message, steps)
-    try:
+    with keep_replies(recorder, model):
         request, reply = conversation.start(candidates, pre_verification)
         attempt = conversation.correct(request, reply) if pre_verification else conversation.accept(reply)
-    except (LareError, KeyboardInterrupt) as error:
-        if isinstance(error, DesignError) or not recorder.exchanges:
-            raise
-        status = 2 if isinstance(error, LareError) else 130
-        raise DesignError(str(error) or "stopped", recorder, model.name, status) from error
     return conversation.to_function(attempt)

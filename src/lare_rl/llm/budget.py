@@ -1,4 +1,4 @@
-"""The budget of a design: requests, tokens and time. It is checked before each request, so that it is never exceeded."""
+"""The budget of a design: requests, tokens and time. No request is sent that might exceed it."""
 
 import contextlib
 import time
@@ -12,9 +12,7 @@ from lare_rl.util.findings import format_for_reader
 
 __all__ = ["Budget", "BudgetExceededError", "max_request_tokens"]
 
-_MAX_REPORTED_TOKENS = 1 << 40
-_REPLY_TIMEOUT_S = 120.0
-_REPLY_TIMEOUT_FRACTION = 1 / 8
+_MAX_REPORTED_TOKENS = 1 << 40  # a server that reports more is wrong
 
 
 class BudgetExceededError(LareError):
@@ -55,8 +53,8 @@ class Budget:
 
     @property
     def reply_timeout_s(self) -> float:
-        """The longest time for the next reply: 120 s, or an eighth of the budget if that is longer, while so much is left."""
-        return min(max(_REPLY_TIMEOUT_S, _REPLY_TIMEOUT_FRACTION * self.seconds), self.seconds_left)
+        """The longest time for the next reply: the larger of 120 s and an eighth of `seconds`, but at most the time left."""
+        return min(max(120.0, self.seconds / 8), self.seconds_left)
 
     @property
     def seconds_left(self) -> float:
@@ -67,15 +65,14 @@ class Budget:
         """Count a pause before it begins. Raises `BudgetExceededError` if no time would be left after it."""
         if seconds >= self.seconds_left:
             pause = f", and a pause of {seconds:.0f} s comes next" if seconds else ""
-            raise BudgetExceededError(
-                f"the {format_for_reader(self.seconds, 'seconds')} of waiting for the model are over "
-                f"({self.seconds_used:.0f} s are used{pause})"
-            )
+            used = f"{self.seconds_used:.1f} of {self.seconds:g} s are used"
+            raise BudgetExceededError(f"no time is left to wait for the model ({used}{pause})")
         self.seconds_used += seconds
 
     @contextlib.contextmanager
-    def count_time(self) -> Iterator[None]:
-        """Count the time of the block."""
+    def count_request(self) -> Iterator[None]:
+        """Count a request, and the time of the block."""
+        self.requests_used += 1
         start = time.monotonic()
         try:
             yield
@@ -84,30 +81,29 @@ class Budget:
 
     def timeout_text(self) -> str:
         """Return the longest time for the next reply in words."""
-        return (
-            f"{self.reply_timeout_s:.0f} s at most ({format_for_reader(self.seconds_left, 'seconds')} are left for all)"
-        )
+        remaining = format_for_reader(self.seconds_left, "seconds")
+        return f"{self.reply_timeout_s:.0f} s at most ({remaining} are left for all)"
 
-    def count_reply(self, usage: Any, messages: Sequence[Message], reply_bytes: int) -> None:
+    def count_reply(self, usage: Any, messages: Sequence[Message], reply_bound: int) -> None:
         """Add the tokens of a request and its reply.
 
         Args:
             usage: the numbers that the server reports, or anything else. Without them, bytes count as tokens.
-            reply_bytes: an upper bound on the tokens of the reply.
+            reply_bound: an upper bound on the tokens of the reply.
         """
         try:
             tokens_in, tokens_out = int(usage["prompt_tokens"]), int(usage["completion_tokens"])
             if not (0 <= tokens_in <= _MAX_REPORTED_TOKENS and 0 <= tokens_out <= _MAX_REPORTED_TOKENS):
                 raise ValueError("not a number of tokens")
         except (TypeError, KeyError, ValueError, OverflowError):
-            tokens_in, tokens_out = max_request_tokens(messages), reply_bytes
+            tokens_in, tokens_out = max_request_tokens(messages), reply_bound
             self.estimated = True
         self.tokens_in += tokens_in
         self.tokens_out += tokens_out
 
     def summary(self, prices: tuple[float, float] | None = None) -> str:
         """Return what was used, in one line. `prices` are those of a million tokens in, and of a million tokens out."""
-        estimated = " (counted as bytes: the server gave no numbers)" if self.estimated else ""
+        estimated = " (bytes count as tokens where the server gave no numbers)" if self.estimated else ""
         text = f"{self.requests_used} requests, {self.tokens_in:,} tokens in, {self.tokens_out:,} out{estimated}"
         if prices is not None:
             text += f", {(self.tokens_in * prices[0] + self.tokens_out * prices[1]) / 1e6:.4f} by the given prices"
@@ -115,5 +111,5 @@ class Budget:
 
 
 def max_request_tokens(messages: Sequence[Message]) -> int:
-    """Return an upper bound on the tokens of a request: its bytes, and a few around each message."""
+    """Return an upper bound on the tokens of a request: the bytes of its messages, and 16 more for each."""
     return sum(len(message["content"].encode(errors="replace")) + 16 for message in messages)

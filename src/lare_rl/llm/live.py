@@ -148,16 +148,14 @@ class LiveModel:
     def _request(self, messages: Sequence[Message]) -> str | _Failure:
         max_tokens = min(self.forms.reply_tokens, self.budget.max_reply_tokens(messages, MIN_REPLY_TOKENS))
         request = self.forms.request(self.name, messages, max_tokens, self.temperature)
-        self.budget.requests_used += 1
         api = self._client.responses if self.forms.api == "responses" else self._client.chat.completions
-        create = api.with_streaming_response.create
 
         def fetch() -> bytes:
-            with create(**request) as response:
+            with api.with_streaming_response.create(**request) as response:
                 return read_body(response)
 
         try:
-            with self.budget.count_time():
+            with self.budget.count_request():
                 body = run_in_time(fetch, self.budget.reply_timeout_s)
         except Exception as error:  # the errors of the HTTP library depend on the client's version
             return self._failure(error.__cause__ or error, messages, max_tokens)

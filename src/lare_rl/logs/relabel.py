@@ -154,10 +154,10 @@ def relabel(
         LareError: the log is damaged or empty, `out` cannot be written or exists, or method, function and task do not fit together.
     """
     check_count("updates", updates)
-    if not 0 <= hold_out <= 0.9:
-        raise LareError(f"hold_out = {hold_out} must be between 0 and 0.9")
-    if not 0 < memory <= 1e6:
-        raise LareError(f"memory = {memory} must be positive, and at most 1e6 (GiB)")
+    if not (isinstance(hold_out, int | float | np.number) and 0 <= hold_out <= 0.9):
+        raise LareError(f"hold_out = {hold_out!r} must be between 0 and 0.9")
+    if not (isinstance(memory, int | float | np.number) and 0 < memory <= 1e6):
+        raise LareError(f"memory = {memory!r} must be positive, and at most 1e6 (GiB)")
     task = None if task is None else resolve_task(task, playable=False)
     log = open_log(source, task)
     log.check_output(out, overwrite)

@@ -8,6 +8,7 @@ import numpy as np
 
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.play import Episode
+from lare_rl.errors import check_count
 from lare_rl.latent.verify import N_SAMPLE_STEPS, Steps, evenly_spaced
 from lare_rl.logs.open_log import open_log
 from lare_rl.tasks.spec import TaskSpec, select_states
@@ -15,35 +16,33 @@ from lare_rl.tasks.spec import TaskSpec, select_states
 __all__ = ["logged_episodes", "logged_steps"]
 
 SAMPLED_EPISODES = 64
-"""Number of first episodes from which steps are sampled."""
+"""Steps are sampled from at most so many episodes, the first ones."""
 
 
 def logged_steps(source: Any, task: TaskSpec | str | Path, count: int = N_SAMPLE_STEPS) -> Steps:
-    """Return steps at even distances in the first episodes of a log, for `steps=` of `design`, `load_function` and `verified`.
+    """Return steps at even distances in the first episodes of a log, for `steps=` of `design` and `load_function`.
 
     Args:
         task: a name, a path, or a spec. Its `scored_observation` says whether phi sees the observation before a step, the one
-            after it, or both. With both, the first half of the rows are observations before a step.
-        count: approximate number of steps. A shorter log has fewer.
+            after it, or both. With both, a step gives two rows, and the first half of the rows are observations before a step.
+        count: largest number of rows. A shorter log has fewer.
 
     Returns:
         Observations (n, observation size) and actions (n, action size).
 
     Raises:
-        LareError: the log cannot be read.
+        LareError: the log cannot be read, or `count` is not 1 or more.
     """
+    check_count("count", count)
     task = resolve_task(task, playable=False)
-    observations, actions = [], []
+    steps = []
     for episode in itertools.islice(open_log(source, task).episodes(), SAMPLED_EPISODES):
-        steps = evenly_spaced(len(episode), count)
-        observations.append(
-            select_states(task.scored_observation, episode.observation[steps], episode.next_observation[steps])
-        )
-        actions.append(episode.action[steps])
-    sides = [np.concatenate(side) for side in zip(*observations, strict=True)]
-    observation, action = np.concatenate(sides), np.concatenate(actions * len(sides))
-    rows = evenly_spaced(len(action), count)
-    return observation[rows], action[rows]
+        selected = evenly_spaced(len(episode), count)  # a long episode need not stay in memory
+        steps.append((episode.observation[selected], episode.next_observation[selected], episode.action[selected]))
+    before, after, action = map(np.concatenate, zip(*steps, strict=True))
+    sides = select_states(task.scored_observation, before, after)
+    rows = evenly_spaced(len(sides) * len(action), count)
+    return np.concatenate(sides)[rows], np.concatenate([action] * len(sides))[rows]
 
 
 def logged_episodes(source: Any, task: TaskSpec, count: int) -> list[Episode]:

@@ -52,7 +52,7 @@ def draft_jax_task(environment_id: str) -> Draft:
 
 def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
     """Return the texts by their keys, and the removed lines, from the docstring of the package's class."""
-    documentation = inspect.cleandoc(vars(type(env.env)).get("__doc__") or "")
+    documentation = inspect.cleandoc(type(env.env).__doc__ or "")
     sections = split_sections(FIELD.sub(_heading, documentation))
     lines = single_agent_lines(sections)
     # The mask of available actions is not in the observation.

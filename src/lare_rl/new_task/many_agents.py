@@ -113,7 +113,7 @@ def _name_patterns(kind: str) -> tuple[str, ...]:
 def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
     """Return the texts by their keys, and the removed lines, from the docstring of the class or of its module."""
     module = sys.modules.get(type(env).__module__)
-    docstrings = vars(type(env)).get("__doc__") or "", getattr(module, "__doc__", None) or ""
+    docstrings = type(env).__doc__ or "", getattr(module, "__doc__", None) or ""
     sections = split_sections(max(docstrings, key=len))
     titled = next((body for title, body in sections.items() if title and body.strip()), "")
     summary = sections.get("description") or f"{sections['']}\n\n{titled}"

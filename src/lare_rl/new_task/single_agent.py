@@ -11,12 +11,9 @@ from lare_rl.errors import LareError
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import single_agent_lines, split_sections, unused_titles, write_texts
 from lare_rl.new_task.draft import Draft, count_entries, file_name
-from lare_rl.tasks.spec import PETTINGZOO_PREFIX
+from lare_rl.tasks.spec import PETTINGZOO_PREFIX, split_environment
 
 __all__ = ["draft_task"]
-
-JAX_FAMILIES = ("gymnax", "brax", "playground", "jumanji", "jaxmarl")
-"""Families of packages in JAX."""
 
 
 def draft_task(environment_id: str) -> Draft:
@@ -29,7 +26,7 @@ def draft_task(environment_id: str) -> Draft:
 
         return draft_multi_agent_task(environment_id)
     family, slash, _ = environment_id.partition("/")
-    if slash and family in JAX_FAMILIES:
+    if slash and family in ("gymnax", "brax", "playground", "jumanji", "jaxmarl"):
         from lare_rl.new_task.jax_env import draft_jax_task
 
         return draft_jax_task(environment_id)
@@ -49,15 +46,14 @@ def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
         "action": f"{count_entries(action_size)}{draft.describe_action(env.action_space)}.",
     }
     # An id without a version means the latest version, which may change later.
-    module, colon, name = environment_id.rpartition(":")
-    full_id = f"{module}{colon}{env.spec.id}" if env.spec else environment_id
+    _, name = split_environment(environment_id)
+    full_id = environment_id.removesuffix(name) + env.spec.id if env.spec else environment_id
     unused = unused_titles(sections)
     lines = [
         *draft.head_lines(file_name(name), full_id, (observation_size, action_size), removed, unused),
         draft.SCORE_LINE,
         draft.MEASURES_LINE,
         draft.GROUP_LINE,
+        *([] if env.spec and env.spec.max_episode_steps else [draft.LIMIT_LINE]),
     ]
-    if not (env.spec and env.spec.max_episode_steps):
-        lines.append(draft.LIMIT_LINE)
     return draft.make_draft(file_name(name), lines, texts, space_descriptions, removed, unused_sections=unused)

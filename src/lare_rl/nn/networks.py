@@ -97,7 +97,7 @@ class GRU(eqx.Module):
         self.hidden_projection = Linear(size, 3 * size, key=hidden_key)
 
     def __call__(
-        self, projected: Float[Array, "*batch three_sizes"], h: Float[Array, "*batch size"]
+        self, projected: Float[Array, "*batch gates"], h: Float[Array, "*batch size"]
     ) -> Float[Array, "*batch size"]:
         """Return h'. `projected` is x U, which a caller computes for all steps at once."""
         z, r, n = jnp.split(projected, 3, axis=-1)

@@ -34,7 +34,7 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
     "All runs": {
         "step": "Environment steps of the seed.",
         "seed": "The seed.",
-        "time/steps_per_second": "Environment steps of a seed per second since the last evaluation, this evaluation included.",
+        "time/steps_per_second": "Environment steps of a seed per second since the last evaluation began.",
         RETURN: "Mean true return of the episodes; of a team, the sum over steps of the mean over its living agents.",
         RETURN_STD: "Standard deviation of the true return over these episodes (n in the denominator).",
         LENGTH: "Mean length of these episodes (steps).",

@@ -89,7 +89,7 @@ def assign_accelerators(
         LareError: there are not enough accelerators.
     """
     share = n_accelerators / processes if accelerators is None else accelerators
-    n_processes_per_accelerator = int(1 / share) if 0 < share < 1 else 1
+    n_processes_per_accelerator = int(min(processes, 1 / share)) if 0 < share < 1 else 1
     max_processes = n_accelerators * n_processes_per_accelerator // max(1, int(share))
     if accelerators and processes > max_processes:
         raise LareError(

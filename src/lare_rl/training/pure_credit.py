@@ -123,7 +123,8 @@ def pure_credit(
         LareError: the arguments do not go together.
     """
     counts = {"observation_size": observation_size, "action_size": action_size, "n_envs": n_envs, "n_steps": n_steps}
-    for name, value in (counts | {"max_steps": max_steps, "agents": agents, "capacity": capacity}).items():
+    counts |= {"max_steps": max_steps, "agents": agents, "capacity": capacity, "fit_updates": fit_updates}
+    for name, value in counts.items():
         check_count(name, value)
     if scored_observation not in get_args(ScoredObservation):
         raise LareError(f"scored_observation = {short_repr(scored_observation)}: give 'before', 'after' or 'both'")

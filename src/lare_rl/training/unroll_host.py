@@ -20,8 +20,8 @@ from lare_rl.training.streams import Stream, episode_seed, numpy_generator
 
 __all__ = [
     "add_seed_axis",
-    "evaluate_on_host",
     "evaluate_policy_on_host",
+    "evaluate_turn_on_host",
     "evaluation_policy",
     "policy_turns",
     "record_on_host",
@@ -80,7 +80,7 @@ def record_on_host(
     return EpisodeBatch(steps, mask, None)
 
 
-def evaluate_on_host(
+def evaluate_turn_on_host(
     envs: VecEnv,
     policy: BatchPolicy,
     seeds: Sequence[int],
@@ -88,7 +88,7 @@ def evaluate_on_host(
     first: int = 0,
     on_step: Callable[[], None] = lambda: None,
 ) -> Evaluation:
-    """Evaluate one episode in each of the first `n_episodes` environments of each seed, each from a different initial state.
+    """Evaluate one turn: an episode in each of the first `n_episodes` environments of each seed, each from a different initial state.
 
     The initial states depend only on the seed and on the episode's number, which counts from `first`. So every evaluation of a
     run begins from the same ones, and no training episode does. `on_step` is called after each step of the environments.
@@ -172,7 +172,7 @@ def evaluate_policy_on_host(
     """
     evaluations = []
     for numbers, policy in policy_turns(envs, config, actor, seeds, n_episodes):
-        evaluations.append(evaluate_on_host(envs, policy, seeds, len(numbers), first + numbers.start, on_step))
+        evaluations.append(evaluate_turn_on_host(envs, policy, seeds, len(numbers), first + numbers.start, on_step))
         on_episode(numbers.stop)
     return jax.tree.map(lambda *arrays: np.concatenate(arrays, axis=1), *evaluations)
 

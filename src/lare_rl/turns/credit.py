@@ -135,7 +135,7 @@ class TurnCredit:
         Raises:
             LareError: a value is out of its range.
         """
-        if lambda_ is not None and not (isinstance(lambda_, int | float) and 0 <= lambda_ <= 1):
+        if lambda_ is not None and not (isinstance(lambda_, int | float | np.number) and 0 <= lambda_ <= 1):
             raise LareError(f"lambda_ must be None or a number from 0 to 1, and is {short_repr(lambda_)}")
         self.lambda_, self.window, self.logistic, self.phi = lambda_, check_count("window", window), logistic, phi
         self._errors: tuple[Errors, ...] = ()

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lare_rl.errors import LareError
+from lare_rl.latent.design import DesignError, keep_replies
 from lare_rl.latent.function import normalise_source
 from lare_rl.llm.model import Model, ModelFunction, as_model
 from lare_rl.llm.prompts import MAX_ATTEMPTS, Message, correct
@@ -58,7 +59,7 @@ def design_turn_phi(
         record: the file to which every exchange is written.
 
     Raises:
-        LareError: the model cannot answer, or no attempt passed.
+        LareError: there are fewer than 2 turns. A `DesignError`, with the replies: no attempt passed, or the model cannot answer.
     """
     if len(turns) < 2:
         raise LareError(f"a phi over turns is checked on at least 2 turns, and not on {len(turns)}")
@@ -67,7 +68,8 @@ def design_turn_phi(
     recorder = Recorder("turns", "events", getattr(model, "temperature", None), record)
     problems = ""
     for attempt in range(MAX_ATTEMPTS):
-        reply = model.reply(request, 0)
+        with keep_replies(recorder, model):
+            reply = model.reply(request, 0)
         recorder.add("correct" if attempt else "candidate", request, reply, model.name)
         try:
             source = normalise_source(parse_reply(reply).functions)
@@ -77,7 +79,8 @@ def design_turn_phi(
         except LareError as error:
             problems = str(error)
         request = correct(request, reply, replace_surrogates(problems))
-    raise LareError(f"none of {MAX_ATTEMPTS} attempts passed; the last one failed: {problems.splitlines()[0]}")
+    reason = f"none of {MAX_ATTEMPTS} attempts passed; the last one failed: {problems.splitlines()[0]}"
+    raise DesignError(reason, recorder, model.name)
 
 
 def turn_request(goal: str, tools: Sequence[Mapping[str, Any]], turns: Sequence[Turn]) -> list[Message]:

@@ -48,14 +48,14 @@ class RecurrentNetwork(eqx.Module):
     def unroll(self, x: Float[Array, "time *batch in"]) -> Float[Array, "time *batch out"]:
         """Return the outputs of all steps, from a hidden state of zeros."""
 
-        def step(h: Float[Array, "*batch hidden"], projected: Float[Array, "*batch three"]):
+        def step(h: Float[Array, "*batch hidden"], projected: Float[Array, "*batch gates"]):
             h = self.gru(projected, h)
             return h, h
 
         h = jnp.zeros((*x.shape[1:-1], self.head.weight.shape[-2]))
         return self.head(jax.lax.scan(step, h, self._project(x))[1])
 
-    def _project(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch three"]:
+    def _project(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch gates"]:
         return self.gru.input_projection(jax.nn.relu(self.encoder(x)))
 
 

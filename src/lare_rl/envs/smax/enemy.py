@@ -3,7 +3,7 @@
 A unit attacks if it can. It prefers the unit that it attacked in the previous step, if that unit is alive and in reach; else it
 attacks the closest unit in reach. If no unit is in reach, it walks towards a random one that it sees, sampled anew in each step. If
 it sees none, it walks towards the point reflection of its own start through the centre of the field. It walks along the axis on
-which the goal is further away.
+which its target is further away.
 """
 
 from typing import NamedTuple
@@ -24,7 +24,7 @@ class Memory(NamedTuple):
     goal: Float[Array, "enemies 2"]
     """The point that it walks to while it sees no unit."""
     attacked: Int[Array, " enemies"]
-    """The unit of ours that it attacked in the previous step, or -1."""
+    """The ally (a unit of the side that learns) that it attacked in the previous step, or -1."""
 
 
 def init_memory(scenario: Scenario, battle: Battle) -> Memory:
@@ -36,18 +36,18 @@ def init_memory(scenario: Scenario, battle: Battle) -> Memory:
 def choose_actions(
     scenario: Scenario, battle: Battle, memory: Memory, key: PRNGKeyArray
 ) -> tuple[Int[Array, " enemies"], Memory]:
-    """Return the action of each enemy unit. Its attacks count our units from the last to the first."""
+    """Return the action of each enemy unit. Its attacks count the allies from the last to the first."""
     n_allies, is_alive = scenario.n_allies, alive(battle)
-    attack_range, sight = (scenario.unit_stats(stat)[n_allies:, None] for stat in ("attack_range", "sight"))
+    reach, sight = (scenario.unit_stats(stat)[n_allies:, None] for stat in ("attack_range", "sight"))
     offset = battle.position[:n_allies] - battle.position[n_allies:, None]
     distance = jnp.sqrt(jnp.sum(offset**2, axis=-1))
     visible = (distance < sight) & is_alive[n_allies:, None] & is_alive[:n_allies]
-    in_range = visible & (distance < attack_range)
+    in_reach = visible & (distance < reach)
 
-    previous = jax.nn.one_hot(memory.attacked, n_allies, dtype=bool)
-    keeps = jnp.any(previous & in_range, axis=1)
-    closest = jnp.argmin(jnp.where(in_range, distance, jnp.inf), axis=1)
-    attacks = jnp.any(in_range, axis=1)
+    previous = jax.nn.one_hot(memory.attacked, n_allies, dtype=bool)  # no unit for -1
+    keeps = jnp.any(previous & in_reach, axis=1)
+    closest = jnp.argmin(jnp.where(in_reach, distance, jnp.inf), axis=1)
+    attacks = jnp.any(in_reach, axis=1)
     attacked = jnp.where(attacks, jnp.where(keeps, memory.attacked, closest), -1).astype(jnp.int32)
 
     random_unit = jnp.argmax(jnp.where(visible, jax.random.uniform(key, visible.shape), -1), axis=1)
