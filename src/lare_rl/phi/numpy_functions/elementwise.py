@@ -86,7 +86,7 @@ def clip(a: Operand, a_min: Any = None, a_max: Any = None, *, min: Any = None, m
 
 @numpy_function()
 def nan_to_num(x: Operand, copy: Any = True, nan: Any = 0.0, posinf: Any = None, neginf: Any = None) -> Any:
-    if x.kind != "float":  # all numbers are finite
+    if getattr(x, "kind", "float") != "float":  # all numbers are finite
         return elementwise("where", True, x, x) if copy else x
     numbers = elementwise("where", x != x, nan, x)
     numbers = elementwise("where", numbers == math.inf, MAX_FLOAT32 if posinf is None else posinf, numbers)
