@@ -18,6 +18,7 @@ from helpers.phi_programs import (
     recorded_programs,
     varied_programs,
 )
+from helpers.toy_envs import phi_source
 from lare_rl.phi.evaluate import evaluate
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.registry import FUNCTIONS
@@ -200,6 +201,10 @@ EXPRESSIONS = {
         np.fromfunction(lambda r, c: r + c, (2, 3)).ravel() * x | np.trim_zeros([0, 1, 2, 0])[0] * x | np.cov(t) * x
         np.polynomial.polynomial.polyval(t, np.arange(4).reshape(2, 2))[1, 2] * x | np.isin(i, [1, 3], True)
         np.array_equal(t, t) * x | np.fill_diagonal(np.eye(2), 3) or x | np.finfo(float).eps * x | np.finfo(np.float32).max * 0 * x
+        np.arange(6).reshape(2, 3).item(4) * x | np.arange(6).reshape(2, 3).T.item(1, 0) * x | hasattr(z, "foo") * x
+        t[np.nan_to_num(i) % 4] | (lambda c: [np.nan_to_num(c).fill(5), c][1])(np.arange(6)) * x
+        np.fromiter([1, 2, 3], int, 2).sum() * x | (lambda c: [np.array(c, copy=False).fill(5), c][1])(np.zeros(6)) * x
+        (lambda c: [np.array(c).fill(5), c][1])(np.ones(6)) * x
         np.pi * x | len(type(x).__name__) * x | (0, 1, 0).index(0, 1) * x | np.array([[1, 2], [3, 4]])[1, 0] * x
     """,
 }
@@ -243,6 +248,12 @@ def check_onnx(graph, sizes):
     inputs = dict(zip(("observation", "action"), random_inputs(sizes, rows=7, dtype=np.float32), strict=True))
     (factors,) = session.run(["factors"], inputs)
     np.testing.assert_allclose(factors, evaluate(graph, inputs)["factors"], rtol=2e-3, atol=2e-4)
+
+
+def test_onnx_model_of_integers_that_are_too_large():
+    columns = ("x / 0", "x / 0 - x / 0", "x * 1e20")
+    factors = ", ".join(f"({column}).astype(int)[:, :1] * 1.0" for column in columns)
+    check_onnx(read(phi_source(f"x = observation\nreturn [{factors}]"), 6, 3), (6, 3))
 
 
 @pytest.mark.parametrize("name", CASES)

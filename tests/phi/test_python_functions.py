@@ -24,7 +24,7 @@ EXPRESSIONS = """
     math.isclose(1, 1 + 1e-12) | math.isclose(1, 1.1, rel_tol=0.2) | math.isfinite(1) | math.isinf(math.inf) | math.isnan(0)
     math.gcd(12, 18) | math.lcm(4, 6) | math.factorial(0) | math.factorial(20) | math.prod([2, 3, 4]) | math.prod([2], start=5)
     math.comb(5, 2) | math.comb(200, 2) | math.comb(200, 198) | math.comb(66, 33) | math.comb(3, 5) | math.comb(10 ** 6, 2)
-    math.comb(10 ** 15, 1) | math.comb(5, 0) | math.pi + math.e + math.tau
+    math.fsum([1e16, 1.0, -1e16]) | math.comb(10 ** 15, 1) | math.comb(5, 0) | math.pi + math.e + math.tau
     abs(-3) | pow(2, 10) | 7 // 2 | -7 // 2 | -7 % 3 | 7.5 % -2 | divmod(-7, 3)[1] | round(2.567, 1) | round(2.5) | int(-2.7)
     int('12') | float('1e-3') | bool(3) | max(3, 1, 2) | min([3, 1, 2]) | max([1, -3], key=abs) | sum([1, 2, 3], 4)
     len('abc') | len({1, 2, 2}) | sorted([3, 1, 2])[0] | sorted([3, 1, 2], reverse=True)[0] | list(reversed([1, 2]))[0]
@@ -63,6 +63,11 @@ def test_number_is_that_of_python(expressions):
         "def f(x):\n    x *= 2\nx = [1]\nf(x)\nn = len(x)",
         "def f(x):\n    x += (2, 3)\nx = [1]\nf(x)\nn = len(x)",
         "try:\n    n = float('one')\nexcept ValueError:\n    n = 7",
+        "try:\n    try:\n        [][1]\n    except IndexError:\n        raise\nexcept LookupError:\n    n = 7",
+        "try:\n    try:\n        {}['a']\n    except KeyError as e:\n        raise e\nexcept KeyError:\n    n = 7",
+        "def f(a, b=2):\n    return a * b\ntry:\n    n = f(1, a=3)\nexcept TypeError:\n    n = 7",
+        "def f(a, /, **more):\n    return a + more['a']\nn = f(1, a=3)",
+        "from numpy import *\nn = r_[1, 2][1]",
         "from dataclasses import dataclass, field\n@dataclass\nclass A:\n    x: list = field(default_factory=list)\n"
         "a, b = A(), A()\na.x.append(1)\nn = len(b.x)",
     ],

@@ -4,12 +4,12 @@ import ast
 import difflib
 import functools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import Array, Complex, Masked
+from lare_rl.phi.arrays import Array, Complex, Masked, refuse_complex
 from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.calls import class_attribute
 from lare_rl.phi.complex_numbers import call_with_complex
@@ -18,9 +18,9 @@ from lare_rl.phi.numpy_functions import FUNCTIONS, INDEXED, KIND_OF_DTYPE, Polyn
 from lare_rl.phi.python_functions import BUILTINS
 from lare_rl.phi.runtime import Runtime
 from lare_rl.phi.text import METHODS, call_method
-from lare_rl.phi.values import Bound, Class, Function, Instance, Symbol, value_type
+from lare_rl.phi.values import Bound, Class, Function, Instance, Symbol, describe
 
-__all__ = ["get_attribute", "module_attribute", "resolve_import"]
+__all__ = ["get_attribute", "resolve_import", "symbol_attribute"]
 
 MODULES = {
     "numpy": "np", "numpy.linalg": "np.linalg", "numpy.polynomial": "np.polynomial", "numpy.typing": "np.typing",
@@ -40,7 +40,7 @@ NAMES = frozenset(
     "numbers.Integral np.errstate np.printoptions np.seterr np.set_printoptions np.ndarray np.number np.generic "
     "np.linalg.LinAlgError np.polynomial.legendre np.polynomial.hermite np.polynomial.hermite_e np.polynomial.laguerre np.lib "
     "np.typing.NDArray np.typing.ArrayLike np.s_ np.index_exp".split()
-) | {name for name in MODULES.values() if name.startswith("np.")}
+) | frozenset(MODULES.values())
 """Types, modules and decorators that a program may name."""
 
 CONSTANTS: dict[str, Any] = {
@@ -53,36 +53,30 @@ ARRAY_METHODS = frozenset(
     "sum prod mean max min any all std var ptp argmax argmin argsort cumsum cumprod astype clip round flatten ravel dot repeat "
     "reshape squeeze swapaxes take transpose copy diagonal trace searchsorted nonzero argpartition conj conjugate choose".split()
 )
-"""Methods of arrays that are functions of NumPy with the same name and arguments."""
+"""Methods of arrays. `_call_array_method` calls the function of NumPy that has the same name and does the same."""
 
 
-def resolve_import(statement: ast.Import | ast.ImportFrom) -> Iterable[tuple[str, Any]]:
-    """Return the names that an import defines, and their values."""
+def resolve_import(statement: ast.Import | ast.ImportFrom) -> Iterator[tuple[str, Any]]:
+    """Yield the names that an import defines, and their values."""
     if isinstance(statement, ast.Import):
         for alias in statement.names:
             _check_module(alias.name)
             package = alias.name.partition(".")[0]
             yield alias.asname or package, Symbol(MODULES[alias.name if alias.asname else package])
         return
-    module = statement.module or ""
-    if statement.level:
-        raise RefusedError("E-IMPORT", "relative imports are not available; numpy and math are")
+    module = "." * statement.level + (statement.module or "")
     _check_module(module)
     for alias in statement.names:
+        names = [alias.name]
         if alias.name == "*":
-            prefix = f"{MODULES[module]}."
-            names = [*CONSTANTS, *NAMES, *BUILTINS, *(f"np.{name}" for name in FUNCTIONS)]
-            members = [name for name in names if name.rpartition(".")[0] == MODULES[module]]
-            yield from ((name.removeprefix(prefix), CONSTANTS.get(name, Symbol(name))) for name in members)
-            continue
-        full = f"{module}.{alias.name}"
-        value = Symbol(MODULES[full]) if full in MODULES else module_attribute(MODULES[module], alias.name)
-        yield alias.asname or alias.name, value
+            all_names = (*CONSTANTS, *NAMES, *INDEXED, *BUILTINS, *(f"np.{name}" for name in FUNCTIONS))
+            names = [name.rpartition(".")[2] for name in all_names if name.rpartition(".")[0] == MODULES[module]]
+        yield from ((alias.asname or name, symbol_attribute(MODULES[module], name)) for name in names)
 
 
 def _check_module(name: str) -> None:
     if name not in MODULES:
-        raise RefusedError("E-IMPORT", f"import {name[:60]}: this module is not available; numpy and math are")
+        raise RefusedError("E-IMPORT", f"import {name[:60]}: this module is not available: use numpy and math")
 
 
 def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
@@ -95,8 +89,8 @@ def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
     match owner:
         case Instance() | Class():
             return class_attribute(runtime, owner, name)
-        case Symbol(module):
-            return module_attribute(module, name)
+        case Symbol(owner_name):
+            return symbol_attribute(owner_name, name)
         case Array():
             return _array_attribute(runtime, owner, name)
         case Complex() | complex() if name in ("real", "imag"):
@@ -105,15 +99,17 @@ def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
             return _array_attribute(runtime, owner.real, name)
         case Complex() if name == "T":
             return call_with_complex("transpose", [owner], {})
-        case Complex():
+        case Complex() if name in ARRAY_METHODS:
             return Bound(lambda *args, **kwargs: _call_array_method(owner, name, args, kwargs))
+        case Complex():
+            refuse_complex(f".{name[:60]}")
         case Polynomial() if name == "coef" or (name in ("coeffs", "c") and not owner.rising):
             return owner.falling[::-1] if owner.rising else owner.falling
         case Polynomial() if name == "deriv":
             return Bound(lambda m=1: Polynomial(call_numpy("polyder", [owner.falling, m], {}), owner.rising))
         case np.finfo() | np.iinfo() if name in ("eps", "tiny", "max", "min", "resolution", "smallest_normal"):
             return np.asarray(getattr(owner, name)).item()
-        case str() | list() | dict() if name in METHODS.get(type(owner), METHODS[list]):
+        case str() | list() | dict() if name in METHODS.get(type(owner), ()):
             return Bound(lambda *args, **kwargs: call_method(runtime, owner, name, args, kwargs))
         case tuple() if name in ("index", "count"):
             return Bound(lambda *args: call_method(runtime, list(owner), name, args, {}))
@@ -134,34 +130,29 @@ def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
         case Masked():
             text = f"x[mask].{name[:60]}: rows differ in what a mask selects: use np.where(mask, x, 0)"
             raise RefusedError("E-ROWS", text)
-    raise RefusedError("E-ATTRIBUTE", f".{name[:60]} of a {value_type(owner)} is not available")
+    raise RefusedError("E-ATTRIBUTE", f".{name[:60]} of {describe(owner)} is not available")
 
 
-def module_attribute(module: str, name: str) -> Any:
-    full = f"{module}.{name}"
+def symbol_attribute(owner_name: str, name: str) -> Any:
+    """Return the attribute of a module, a function or a type. Raises `RefusedError` if it is not available."""
+    full = f"{owner_name}.{name}"[:80]
     if full in CONSTANTS:
         return CONSTANTS[full]
     if name == "__name__":
-        return module.rpartition(".")[2]
-    if module in ("typing", "__future__") or full in NAMES or full in BUILTINS:
+        return owner_name.rpartition(".")[2]
+    if owner_name in ("typing", "__future__") or full in NAMES or full in INDEXED or full in BUILTINS:
         return Symbol(full)
-    if module.startswith("np"):
-        short = full.removeprefix("np.")
-        if short in FUNCTIONS or full in INDEXED or short in KIND_OF_DTYPE or f"{short}.outer" in FUNCTIONS:
-            return Symbol(full)
-        raise RefusedError("E-NUMPY", f"{full[:80]} is not available{_hint(full)}")
-    raise RefusedError("E-ATTRIBUTE", f"{full[:80]} is not available{_hint(full)}")
+    short, is_numpy = full.removeprefix("np."), full.startswith("np.")
+    if is_numpy and (short in FUNCTIONS or short in KIND_OF_DTYPE):
+        return Symbol(full)
+    raise RefusedError("E-NUMPY" if is_numpy else "E-ATTRIBUTE", f"{full} is not available{_hint_or_near_name(full)}")
 
 
 @functools.lru_cache(maxsize=256)
-def _hint(full: str) -> str:
-    """Return what to write instead of a name that is not available."""
-    full = full[:80]
-    if hint := find_hint(full):
-        return hint
-    names = [f"np.{name}" for name in FUNCTIONS] + list(BUILTINS)
-    near = difflib.get_close_matches(full, names, 1, 0.8)
-    return f": is {near[0]} meant?" if near else ""
+def _hint_or_near_name(full: str) -> str:
+    """Return what to write instead of a name, as the end of a message. Empty if nothing is known."""
+    near = difflib.get_close_matches(full, [*(f"np.{name}" for name in FUNCTIONS), *BUILTINS], 1, 0.8)
+    return find_hint(full) or (f": is {near[0]} meant?" if near else "")
 
 
 def _array_attribute(runtime: Runtime, array: Array, name: str) -> Any:
@@ -177,9 +168,9 @@ def _array_attribute(runtime: Runtime, array: Array, name: str) -> Any:
         case "dtype":
             return Symbol({"float": "np.float32", "int": "np.int64", "bool": "np.bool_"}[array.kind])
         case "flat":
-            return tuple(runtime.items(call_numpy("ravel", [array], {})))  # so that nothing is written into a copy
+            return tuple(runtime.items(call_numpy("ravel", [array], {})))  # a tuple: writing into a copy must fail
         case "item":
-            return Bound(lambda *index: (array[index] if index else array).number())
+            return Bound(lambda *i: (call_numpy("ravel", [array], {}) if len(i) == 1 else array)[i].number())
         case "tolist":
             return Bound(lambda: _to_list(runtime, array))
         case "fill":

@@ -140,18 +140,17 @@ def _bind_arguments(function: Function, args: Sequence[Any], kwargs: Mapping[str
     if len(args) > len(positional) and parameters.vararg is None:
         raise TypeError(f"{function.name} takes {len(positional)} arguments, and {len(args)} were given")
     values |= dict(zip(positional, args, strict=False))
-    unused = dict(kwargs)
-    for name in [*positional, *keyword_only]:
-        if name in unused:
-            values[name] = unused.pop(name)
-        if name not in values:
-            raise TypeError(f"{function.name} needs the argument {name!r}")
+    names = [*positional[len(args) :], *keyword_only]
+    values |= {name: kwargs[name] for name in names if name in kwargs}
+    unused = {name: value for name, value in kwargs.items() if name not in names}
+    if missing := [name for name in names if name not in values]:
+        raise TypeError(f"{function.name} needs the argument {missing[0]!r}")
     if parameters.vararg is not None:
         values[parameters.vararg.arg] = tuple(args[len(positional) :])
     if parameters.kwarg is not None:
         values[parameters.kwarg.arg] = unused
     elif unused:
-        raise TypeError(f"{function.name} has no argument {next(iter(unused))!r}")
+        raise TypeError(f"{function.name} has no further argument {next(iter(unused))!r}")
     return values
 
 

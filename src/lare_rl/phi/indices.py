@@ -26,32 +26,33 @@ ALL = slice(None)
 
 def is_mask(entry: Any) -> bool:
     """Return whether an entry of an index is an array of truth values."""
-    return getattr(entry, "kind", None) == "bool"
+    return hasattr(entry, "is_row_number") and entry.kind == "bool"
 
 
 def index_entries(layout: Layout, items: Sequence[Any]) -> list[Any]:
     """Return an index as an entry for each axis, and None for each new one: slices, integers, arrays of integers."""
+    n_axes = sum(item.ndim if is_mask(item) else 1 for item in items if item is not None and item is not ...)
+    n_ellipses = sum(item is ... for item in items)
+    if n_axes > layout.ndim or n_ellipses > 1:
+        raise IndexError(f"too many indices for an array of the shape {layout.shape}")
     entries: list[Any] = []
-    for item in items:
-        if isinstance(item, slice):
-            entries.append(_read_slice(item))
-        elif item is None or item is ...:
-            entries.append(item)
+    for item in items if n_ellipses else (*items, ...):
+        if item is ...:
+            entries.extend([ALL] * (layout.ndim - n_axes))
+        elif item is None or isinstance(item, slice):
+            entries.append(None if item is None else _read_slice(item))
+        elif is_mask(item) and item.constant is not None:
+            start = sum(entry is not None for entry in entries)
+            if item.row_shape != layout.row_shape[start : start + item.ndim]:
+                raise IndexError(f"a mask of the shape {item.shape} does not fit an array of the shape {layout.shape}")
+            entries.extend(item.constant.nonzero())
         elif hasattr(item, "is_row_number"):
-            if item.constant is None:
-                entries.append(item)
-            else:
-                entries.extend(item.constant.nonzero() if item.kind == "bool" else [_check_integers(item).constant])
+            entries.append(item if item.constant is None else _check_integers(item).constant)
         elif isinstance(item, (bool, float)):
             raise IndexError(f"{item} is not an index: an index is an integer, a slice or an array of integers")
         else:
             entries.append(operator.index(item))
-    n_axes = sum(entry.ndim if is_mask(entry) else 1 for entry in entries if entry is not None and entry is not ...)
-    ellipses = [i for i, entry in enumerate(entries) if entry is ...]
-    if n_axes > layout.ndim or len(ellipses) > 1:
-        raise IndexError(f"too many indices for an array of the shape {layout.shape}")
-    i = ellipses[0] if ellipses else len(entries)
-    return [*entries[:i], *[ALL] * (layout.ndim - n_axes), *entries[i + 1 :]]
+    return entries
 
 
 def _read_slice(entry: slice) -> slice:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from lare_rl.phi.evaluate import MAX_INT32_IN_FLOAT32
 from lare_rl.phi.graph import KIND_OF_CODE, Graph, Node
 
 __all__ = ["BATCH", "DTYPES", "is_onnx_installed", "onnx_model"]
@@ -126,6 +127,9 @@ class _Writer:
                 return self.constant(option)
             case "cast" if kind == "bool":
                 return op("Not", op("Equal", x[0], np.zeros((), DTYPES[inputs[0].kind])))
+            case "cast" if kind == "int" and inputs[0].kind == "float":
+                limited = op("Max", op("Min", x[0], MAX_INT32_IN_FLOAT32), -MAX_INT32_IN_FLOAT32)
+                return self.cast(op("Where", op("IsNaN", x[0]), 0.0, limited), kind)
             case "cast":
                 return self.cast(x[0], kind)
             case "gather" | "take" | "concat" | "einsum":

@@ -10,7 +10,7 @@ import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 from lare_rl.phi.arrays import Array, concatenate
-from lare_rl.phi.attributes import module_attribute
+from lare_rl.phi.attributes import symbol_attribute
 from lare_rl.phi.builder import Builder, building, current_builder
 from lare_rl.phi.graph import Graph
 from lare_rl.phi.interpreter import Interpreter
@@ -157,7 +157,7 @@ def _unavailable_names(tree: ast.Module, module: Scope) -> list[str]:
         owner = module.get(root.id) if isinstance(root, ast.Name) else None
         try:
             for name in reversed(names):
-                owner = module_attribute(owner.name, name) if isinstance(owner, Symbol) else None
+                owner = symbol_attribute(owner.name, name) if isinstance(owner, Symbol) else None
         except RefusedError as refusal:
             messages.append(refusal.located(node.lineno))
             if len(messages) == MAX_MESSAGES:

@@ -4,6 +4,7 @@ Conditions and loops cannot depend on the numbers of a row, so all of them have 
 """
 
 import ast
+import sys
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -259,14 +260,16 @@ def _assert(runtime: Runtime, test: ast.expr, message: ast.expr | None, scope: S
 
 
 def _raise(runtime: Runtime, error: ast.expr | None, scope: Scope) -> None:
-    name, message = "Exception", ""
+    """Carry out `raise`. What names no class, such as `raise` alone or `raise e`, raises the error that is handled now."""
+    message = ""
     if isinstance(error, ast.Call):
         message = " ".join(_message_text(runtime, arg, scope) for arg in error.args if not isinstance(arg, ast.Starred))
         error = error.func
-    if error is not None:
-        cls = runtime.evaluate(error, scope)
-        name = cls.name if isinstance(cls, (Symbol, Class)) else name
-    raise ProgramError(name, message)
+    cls = None if error is None else runtime.evaluate(error, scope)
+    if isinstance(cls, (Symbol, Class)):
+        raise ProgramError(cls.name, message)
+    handled = sys.exception()
+    raise handled if isinstance(handled, PYTHON_ERRORS) else ProgramError("Exception", message)
 
 
 def _message_text(runtime: Runtime, node: ast.expr, scope: Scope) -> str:

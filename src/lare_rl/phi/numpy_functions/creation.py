@@ -28,8 +28,8 @@ from lare_rl.phi.numpy_functions.shapes import meshgrid
 
 
 @numpy_function()
-def array(object: Any, dtype: Any = None, ndmin: Any = 0) -> Array:  # noqa: A002
-    x = asarray(as_array(object), dtype).copy()
+def array(object: Array, dtype: Any = None, *, copy: Any = True, ndmin: Any = 0) -> Array:  # noqa: A002
+    x = asarray(object.copy() if copy else object, dtype)
     return x[(None,) * (ndmin - x.ndim)] if ndmin > x.ndim else x
 
 
@@ -40,7 +40,7 @@ def asarray(a: Array, dtype: Any = None, order: Any = None) -> Array:
 
 @numpy_function()
 def fromiter(iter: Array, dtype: Any, count: int = -1) -> Array:  # noqa: A002
-    return asarray(iter, dtype)[: count if count >= 0 else None]
+    return asarray(iter, dtype)[range(count) if count >= 0 else slice(None)]
 
 
 @numpy_function()

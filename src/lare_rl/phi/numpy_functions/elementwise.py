@@ -86,6 +86,8 @@ def clip(a: Operand, a_min: Any = None, a_max: Any = None, *, min: Any = None, m
 
 @numpy_function()
 def nan_to_num(x: Operand, copy: Any = True, nan: Any = 0.0, posinf: Any = None, neginf: Any = None) -> Any:
+    if getattr(x, "kind", "float") != "float":  # all numbers are finite
+        return elementwise("where", True, x, x) if copy else x
     numbers = elementwise("where", x != x, nan, x)
     numbers = elementwise("where", numbers == math.inf, MAX_FLOAT32 if posinf is None else posinf, numbers)
     numbers = elementwise("where", numbers == -math.inf, -MAX_FLOAT32 if neginf is None else neginf, numbers)

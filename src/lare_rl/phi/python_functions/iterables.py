@@ -35,7 +35,7 @@ def range_(runtime: Runtime, *ends: Any) -> range:
     return result
 
 
-@builtin("sum", "math.fsum")
+@builtin("sum")
 def sum_(runtime: Runtime, values: Any, start: Any = 0) -> Any:
     return functools.reduce(lambda x, y: runtime.binary(ast.Add(), x, y), runtime.items(values), start)
 
@@ -116,6 +116,7 @@ BUILTINS |= {
     "enumerate": lambda runtime, values, start=0: Iterator(enumerate(runtime.items(values), operator.index(start))),
     "map": lambda runtime, f, *values: _map(runtime, f, zip(*map(runtime.items, values), strict=False)),
     "itertools.starmap": lambda runtime, f, values: _map(runtime, f, map(runtime.items, runtime.items(values))),
+    "math.fsum": lambda runtime, values: math.fsum(map(float, runtime.items(values))),
     "slice": lambda _, *ends: slice(*ends),
     "print": lambda _, *values, **more: None,
     "str": lambda runtime, value="": format_value(runtime.meter, value, ""),
@@ -135,7 +136,6 @@ BUILTINS |= {
     ),
     "operator.attrgetter": lambda runtime, name: Bound(lambda x: runtime.attribute(x, name)),
 }
-
 
 LENGTHS: dict[str, Callable[..., int]] = {
     "chain": lambda *x: sum(map(len, x)),
