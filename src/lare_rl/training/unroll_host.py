@@ -23,7 +23,7 @@ __all__ = [
     "evaluate_on_host",
     "evaluate_policy_on_host",
     "evaluation_policy",
-    "policy_turns",
+    "policy_batches",
     "record_on_host",
     "unroll_on_host",
 ]
@@ -138,7 +138,7 @@ def evaluation_policy(
     return act
 
 
-def policy_turns(
+def policy_batches(
     envs: VecEnv, config: TrainConfig, actor: Any, seeds: Sequence[int], n_episodes: int
 ) -> Iterator[tuple[range, BatchPolicy]]:
     """Yield the numbers of the episodes that begin together, and their policy, until each seed has `n_episodes`.
@@ -171,7 +171,7 @@ def evaluate_policy_on_host(
         on_episode: called with the number of episodes that each seed has finished, after each turn.
     """
     evaluations = []
-    for numbers, policy in policy_turns(envs, config, actor, seeds, n_episodes):
+    for numbers, policy in policy_batches(envs, config, actor, seeds, n_episodes):
         evaluations.append(evaluate_on_host(envs, policy, seeds, len(numbers), first + numbers.start, on_step))
         on_episode(numbers.stop)
     return jax.tree.map(lambda *arrays: np.concatenate(arrays, axis=1), *evaluations)
