@@ -19,7 +19,6 @@ from lare_rl.envs.interface import JaxEnv
 from lare_rl.evaluation.played_episodes import compute_training_rewards, unroll_policy
 from lare_rl.runs.directory import Run, open_run
 from lare_rl.training.decoder_inputs import compute_host_factors
-from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from measure import apart, correlation, write
@@ -31,10 +30,10 @@ Rewards = Float[np.ndarray, "episodes steps agents"]
 
 def true_and_proxy_rewards(run: Run, seed_index: int) -> tuple[Rewards, Rewards]:
     """True and proxy rewards of some episodes of a seed."""
-    (config, learner, *_), env = load_learner(run), make_env(run.config.task)
+    state, env = load_learner(run), make_env(run.config.task)
     assert isinstance(env, JaxEnv)
-    one_seed = jax.tree.map(lambda leaf: leaf[seed_index : seed_index + 1], learner.algorithm)
-    actor = get_actor(one_seed, run.config.settings.steps, config)
+    config, learner = state.config, state.learner
+    actor = jax.tree.map(lambda leaf: leaf[seed_index : seed_index + 1], state.actor)
     steps = unroll_policy(env, config, actor, EPISODES, KEY).steps
     proxy = compute_training_rewards(
         select_seed(learner, seed_index), steps, compute_host_factors(run, config, steps), config

@@ -101,8 +101,9 @@ def test_step_and_last_quarter(make_run):
 @pytest.mark.parametrize(
     ("runs", "metric", "message"),
     [
-        ([("a", "Chase", {}), ("b", "Reacher-v4", {})], RETURN, "returns of Chase have no common scale"),
-        ([("a", "Walker2d-v4", {}), ("b", "Reacher-v4", {})], "critic/loss", "critic/loss has no common scale"),
+        ([], RETURN, "no results"),
+        ([("a", "Chase", {}), ("b", "Reacher-v4", {})], RETURN, "return has no common scale over Chase, Reacher"),
+        ([("a", "Walker2d-v4", {}), ("b", "Reacher-v4", {})], "critic/loss", "loss has no common scale over Reacher"),
         (
             [("a", "Walker2d-v4", {}), ("a", "Reacher-v4", {}), ("b", "Reacher-v4", {"seed": 2})],
             RETURN,

@@ -36,7 +36,7 @@ from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.session import start_session
-from lare_rl.training.unroll_host import evaluate_turn_on_host, evaluation_policy
+from lare_rl.training.unroll_host import evaluate_batch_on_host, evaluation_policy
 from lare_rl.util.statistics import format_mean_std
 
 
@@ -232,7 +232,7 @@ def test_evaluate_continues_after_initial_states_of_run(run, returns):
     actor = get_actor(state.learner.algorithm, 60, state.config)
     policy = evaluation_policy(state.config, actor, run.seeds, np.arange(4), 4)
     with LocalVecEnv([partial(make_host_env, TASK)] * 8) as envs:
-        first_returns = evaluate_turn_on_host(envs, policy, run.seeds, 4).returns[..., 0]
+        first_returns = evaluate_batch_on_host(envs, policy, run.seeds, 4).returns[..., 0]
     last_evaluation = [line["evaluation/return"] for line in run.metrics()[-2:]]
     np.testing.assert_allclose(first_returns[:, :2].mean(axis=1), last_evaluation, rtol=1e-5)
     np.testing.assert_allclose(returns[:, :2], first_returns[:, 2:], rtol=1e-5)

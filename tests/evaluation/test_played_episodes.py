@@ -1,15 +1,18 @@
 """Rollouts of runs whose agents leave, and whose episodes are paid several times."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lare_rl
-from helpers.jax_toy_envs import echo_spec
+from helpers.jax_toy_envs import Echo, echo_spec
 from helpers.numpy_twins import assert_close
-from helpers.small_configs import add_steps, random_steps
+from helpers.small_configs import SMALL_SETTINGS, add_steps, random_steps
 from lare_rl.config.resolve import resolve
+from lare_rl.errors import LareError
 from lare_rl.evaluation import played_episodes as module
-from lare_rl.evaluation.played_episodes import compute_training_rewards, play_run, sample_steps
+from lare_rl.evaluation.played_episodes import compute_training_rewards, play_run, sample_steps, unroll_policy
 from lare_rl.runs.directory import create_run
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
@@ -51,6 +54,42 @@ def no_rewards():
 @pytest.fixture(scope="module")
 def played(run):
     return play_run(run, N_EPISODES)
+
+
+class Broken(Echo):
+    """It shows and pays NaN after the end of an episode."""
+
+    def step(self, state, action, key):
+        next_state, timestep = super().step(state, action, key)
+        ended = state.step >= state.length
+        values = {
+            name: jnp.where(ended, jnp.nan, getattr(timestep, name)) for name in ("observation", "state", "reward")
+        }
+        return next_state, timestep._replace(**values)
+
+
+def test_steps_after_an_end_are_not_seen(run):
+    state = load_learner(run)
+    batch = unroll_policy(Broken(), state.config, jax.tree.map(lambda leaf: leaf[:1], state.actor), N_EPISODES, 0)
+    assert len({int(n) for n in batch.mask.sum(axis=0)}) > 1
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(batch))
+
+
+def test_actor_is_that_of_the_checkpoint(tmp_path, monkeypatch):
+    """A run of QMIX that was stopped before its first step explores in every step."""
+    settings = lare_rl.Settings(
+        method="ircr", algorithm="qmix", steps=120, rollout_steps=60, environments=2, qmix=SMALL_SETTINGS["qmix"]
+    )
+    session = start_session(create_run(tmp_path / "qmix", TASK, resolve(settings, TASK), ()))
+    session.save()
+    session.close()
+
+    def unroll(run, config, actor, n_episodes):
+        raise LareError(f"epsilon {float(actor.epsilon[0])}")
+
+    monkeypatch.setattr(module, "_unroll_on_host", unroll)
+    with pytest.raises(LareError, match=r"epsilon 1\.0"):
+        play_run(session.run)
 
 
 def test_exact_rewards_add_up_to_payments(run, played):

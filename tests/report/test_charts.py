@@ -83,6 +83,11 @@ def test_labels_do_not_overlap():
     assert 50 <= max(tops) <= 100
 
 
+def test_a_label_outside_fixed_limits_does_not_move_others():
+    html = chart(Line(X, X - 6, "c0", "low"), Line(X, X / 2, "c1", "high"), limits=(-1.0, 1.0))
+    assert re.findall(r'class="label[^>]*top:([-\d.]+)%', html) == ["100.0", "0.0"]
+
+
 def test_bars_point_to_the_side_of_their_amounts():
     html = draw_bars([Bar("<speed>", "f", 0.9, "plus", "more"), Bar("cost", "g", -0.3, "minus", "less")])
     check_markup(html)
@@ -93,6 +98,7 @@ def test_bars_point_to_the_side_of_their_amounts():
     assert "<i" not in draw_bars([Bar("speed", "f", 0.001, "plus", "")])
     only_right = draw_bars([Bar("speed", "f", 0.9, "plus", "")])
     assert "left:0.0%;width:100.0%" in only_right
+    assert "<li" not in draw_bars([])
 
 
 def test_strips_share_a_scale_if_they_are_comparable():

@@ -120,7 +120,7 @@ def test_report_of_several_runs(make_run, tmp_path):
     assert not re.search(r"-[\d.]", comparison)
     assert "1.00" in comparison  # the probability that the best run wins
     chart = page[page.index('class="chart') :].partition("</svg>")[0]
-    assert [n_lines(chart, style) for style in ("c0", "c1", "c2", "c3", "grey other")] == [1, 1, 1, 1, 2]
+    assert [n_lines(chart, style) for style in ("c0", "c1", "c2", "c3", "grey faint")] == [1, 1, 1, 1, 2]
     settings = page[page.index("differ between") :].partition("</table>")[0]
     assert "method" in settings
     assert "evaluation_episodes" not in settings

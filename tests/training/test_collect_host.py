@@ -23,7 +23,7 @@ from lare_rl.training.compiled import compile_functions, init_seeds
 from lare_rl.training.divergence import DivergedError
 from lare_rl.training.policy import get_actor
 from lare_rl.training.streams import Stream, episode_seed, seed_keys, stream_keys
-from lare_rl.training.unroll_host import evaluate_policy_on_host, evaluate_turn_on_host, record_on_host
+from lare_rl.training.unroll_host import evaluate_policy_on_host, evaluate_batch_on_host, record_on_host
 
 
 class Wrapped(gymnasium.Wrapper):
@@ -172,7 +172,7 @@ def proportional(factor):
 
 def test_evaluate_initial_states_and_returns():
     def returns(seeds=(0, 1), first=0, factor=0.0):
-        return evaluate_turn_on_host(local_envs(3 * len(seeds)), proportional(factor), seeds, 3, first=first).returns[
+        return evaluate_batch_on_host(local_envs(3 * len(seeds)), proportional(factor), seeds, 3, first=first).returns[
             ..., 0
         ]
 
@@ -211,7 +211,7 @@ def test_evaluated_episode_does_not_depend_on_the_number_of_environments():
 def test_evaluate_episodes_of_different_lengths(wrap):
     wrap(lengths=iter((3, 1, 7) * 2))
     envs = local_envs(3, WRAPPED.model_copy(update={"measures": ("left",)}))
-    evaluation = evaluate_turn_on_host(envs, proportional(0.0), [0], 3)
+    evaluation = evaluate_batch_on_host(envs, proportional(0.0), [0], 3)
     np.testing.assert_array_equal(evaluation.returns[..., 0], [[3, 1, 7]])
     np.testing.assert_array_equal(evaluation.summed_returns, evaluation.returns)
     np.testing.assert_array_equal(evaluation.lengths, [[3, 1, 7]])
@@ -238,7 +238,7 @@ def test_policy_that_is_nan_is_reported():
     with pytest.raises(DivergedError, match="policy of seed 1"):
         envs.collect_by(lambda timestep, noise, episode_start: action, np.zeros((1, 2, 1, 1, 1)))
     with pytest.raises(DivergedError, match="policy of seed 1"):
-        evaluate_turn_on_host(local_envs(2), lambda timestep, episode_start: action, (0, 1), 1)
+        evaluate_batch_on_host(local_envs(2), lambda timestep, episode_start: action, (0, 1), 1)
 
 
 def test_collect_locates_bad_outputs(wrap):
@@ -266,6 +266,6 @@ def test_restore_and_evaluate_locate_bad_outputs(wrap):
         make_envs((4,), task=WRAPPED).restore(envs.state_dict())
     wrap(reward=float("nan"), seeds={episode_seed(1, Stream.EVALUATION_EPISODES, 2)})
     envs = local_envs(4, WRAPPED)
-    evaluate_turn_on_host(envs, proportional(0.0), (0, 1), 2)
+    evaluate_batch_on_host(envs, proportional(0.0), (0, 1), 2)
     with pytest.raises(EnvOutputError, match=r"nan.*, at step 3 of the episode, in an evaluation of seed 1$"):
-        evaluate_turn_on_host(envs, proportional(0.0), (0, 1), 2, first=1)
+        evaluate_batch_on_host(envs, proportional(0.0), (0, 1), 2, first=1)

@@ -1,6 +1,7 @@
 """The command `turn-credit`: files of rollouts, the page, and mistakes of one line."""
 
 import json
+import re
 
 import pytest
 
@@ -79,6 +80,7 @@ def test_bad_files(tmp_path, content, words):
         read_rollout_file(path)
     assert all(word in str(error.value) for word in words)
     assert "\n" not in str(error.value)
+    assert len(re.findall(r"line \d", str(error.value))) <= 1
 
 
 def test_turn_phi_prints_the_request(command, tmp_path, file):

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from lare_rl.errors import LareError
+from lare_rl.turns.files import read_rollout_file
 from lare_rl.util.safe_io import MAX_DEPTH, read_json, read_text, read_toml
 
 
@@ -75,6 +76,7 @@ def test_unreadable_text(tmp_path, content, words):
         read_text(path, 1 << 20)
 
 
-def test_path_with_a_null_character():
+@pytest.mark.parametrize("read", [read_text, read_rollout_file])
+def test_path_with_a_null_character(read):
     with pytest.raises(LareError, match="null"):
-        read_text(Path("a\0b"))
+        read(Path("a\0b"))

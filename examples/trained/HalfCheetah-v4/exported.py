@@ -90,6 +90,8 @@ def _as_array(key, values, spec):
     """Return the values as an array. Its last axes must have the sizes that `export.json` lists after the batch."""
     array = np.asarray(values, spec["type"])
     sizes = tuple(spec["shape"][1:])
+    if key == "length" and array.ndim == 0:
+        array = array.reshape(sizes)  # (1,) if there are agents
     if array.shape[array.ndim - len(sizes) :] != sizes:
         expected = ", ".join(map(str, spec["shape"]))
         raise ValueError(f"{key} must have the shape ({expected}), and has {array.shape}")

@@ -21,9 +21,7 @@ from lare_rl.compare.bootstrap import (
     two_sided_p,
 )
 from lare_rl.compare.results import LearningCurve
-from lare_rl.compare.scores import LAST_RETURN, LabelScores, ScoreChoice, group_results
-from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
-from lare_rl.runs.metric_names import RETURN
+from lare_rl.compare.scores import LAST_RETURN, LabelScores, ScoreChoice, group_results, has_common_scale
 from lare_rl.util.statistics import Band, sample_std
 
 __all__ = ["Comparison", "OverallRow", "Row", "compare", "compare_over_tasks", "compare_tasks"]
@@ -92,7 +90,7 @@ def compare(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_RETURN)
     Raises `LareError` if some results are missing.
     """
     groups = group_results(results, choice)
-    final = {group.label: group.run_scores for group in groups}
+    final = {group.label: group.seed_scores for group in groups}
     baseline = final[groups[0].label]
     steps = np.array(groups[0].steps, float)
     thresholds = np.linspace(min(map(np.min, final.values())), max(map(np.max, final.values())), 101)
@@ -112,7 +110,7 @@ def compare(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_RETURN)
 def compare_tasks(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_RETURN) -> list[Comparison]:
     """Compare all tasks together, or each task alone if their scores have no common scale."""
     tasks = sorted({result.task for result in results})
-    if len(tasks) == 1 or (choice.metric == RETURN and all(task in REFERENCE_RETURNS for task in tasks)):
+    if has_common_scale(tasks, choice.metric):
         return [compare(results, choice)]
     return [compare([result for result in results if result.task == task], choice) for task in tasks]
 
@@ -130,7 +128,7 @@ def compare_over_tasks(comparisons: Sequence[Comparison]) -> list[OverallRow]:
     for label in comparisons[0].groups:
         groups = [comparison.groups[label] for comparison in comparisons if label in comparison.groups]
         if len(groups) == len(comparisons) and len({len(group.seeds) for group in groups}) == 1:
-            final[label] = np.concatenate([group.run_scores for group in groups], axis=1)
+            final[label] = np.concatenate([group.seed_scores for group in groups], axis=1)
     baselines = {comparison.rows[0].label for comparison in comparisons}
     if len(baselines) > 1 or not final.keys() > baselines:
         return []
@@ -142,7 +140,7 @@ def compare_over_tasks(comparisons: Sequence[Comparison]) -> list[OverallRow]:
 
 
 def _make_row(group: LabelScores, baseline: Scores | None) -> Row:
-    scores = group.run_scores
+    scores = group.seed_scores
     seed_means = scores.mean(axis=1)
     improvement, p_value = _improvement(scores, baseline)
     draw_mean = difference = None

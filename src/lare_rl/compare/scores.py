@@ -1,10 +1,10 @@
 """The scores of a comparison, as arrays.
 
-A *score* is the value of the metric at an evaluation. If there are several tasks, the metric is the return, and it is scaled: 0 is
-the return of a random policy, and 1 about the highest published return of TD3 on true rewards (`REFERENCE_RETURNS`, for some tasks).
+The *score of a run* is the value of the metric at an evaluation. If there are several tasks, the metric is the return, and it is scaled:
+0 is the return of a random policy, and 1 about the highest published return of TD3 on true rewards (`REFERENCE_RETURNS`, for some tasks).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -18,7 +18,7 @@ from lare_rl.errors import LareError
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
 
-__all__ = ["LAST_RETURN", "LabelScores", "ScoreChoice", "group_results", "last_quarter"]
+__all__ = ["LAST_RETURN", "LabelScores", "ScoreChoice", "group_results", "has_common_scale", "last_quarter"]
 
 
 class ScoreChoice(NamedTuple):
@@ -50,7 +50,7 @@ class LabelScores:
     """The scores at the last step, or their means over the last quarter of the steps."""
 
     @property
-    def run_scores(self) -> Float[np.ndarray, "seeds tasks"]:
+    def seed_scores(self) -> Float[np.ndarray, "seeds tasks"]:
         """The final scores, averaged over the draws."""
         return self.final_scores.mean(axis=0)
 
@@ -60,17 +60,19 @@ _CurveKey = tuple[str, str, int, int]
 
 
 def group_results(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_RETURN) -> list[LabelScores]:
-    """Return the scores of each label: the name of a method in the comparison.
+    """Return the scores of each label: a method, and what distinguishes it from other rows.
 
-    Raises `LareError` if a label lacks a task, draw or seed, or not all results have a value at the chosen step.
+    Raises `LareError` if there are no results, a label lacks a task, draw or seed, or not all results have a value at the chosen step.
     """
-    tasks = tuple(sorted({result.task for result in results}))
+    if not results:
+        raise LareError("there are no results to compare")
+    tasks = tuple(sorted({curve.task for curve in results}))
     _check_tasks(results, tasks, choice.metric)
     curves = _index_curves(results, choice.metric)
     steps = _shared_steps(curves, choice)
     n_final = len(last_quarter(steps)) if choice.average_last_quarter else 1
     groups = []
-    for label in dict.fromkeys(result.label for result in results):
+    for label in dict.fromkeys(curve.label for curve in results):
         group = [curve for curve in curves.values() if curve.label == label]
         draws = tuple(sorted({curve.draw for curve in group}))
         seeds = tuple(sorted({curve.seed for curve in group}))
@@ -105,7 +107,7 @@ def _fill_scores(
             hint = ", or compare each task alone" if len(tasks) > 1 else ""
             raise LareError(
                 f"{label} has no run on {task} with seed {seed} and draw {draw}, and needs the same seeds for every task and "
-                f"draw: train it{hint}"
+                f"draw: train it, or add it to the table{hint}"
             )
         scores[i, j, k] = [curves[key].values[step] for step in steps]
     if len(tasks) > 1:
@@ -119,42 +121,45 @@ def last_quarter(steps: Sequence[int]) -> list[int]:
     return [step for step in steps if 4 * step > 3 * steps[-1]]
 
 
+def has_common_scale(tasks: Collection[str], metric: str) -> bool:
+    """Return whether the scores of some tasks can be averaged: those of one task, or returns that can be scaled."""
+    return len(tasks) == 1 or (metric == RETURN and all(task in REFERENCE_RETURNS for task in tasks))
+
+
 def _check_tasks(results: Sequence[LearningCurve], tasks: Sequence[str], metric: str) -> None:
     """Raise `LareError` if scores of several tasks have no common scale, or two tasks have the same name."""
-    if len(tasks) > 1 and metric != RETURN:
-        raise LareError(f"{metric} has no common scale over several tasks: compare each task alone")
-    if len(tasks) > 1 and (unknown := [task for task in tasks if task not in REFERENCE_RETURNS]):
-        raise LareError(f"the returns of {', '.join(unknown)} have no common scale: compare each task alone")
+    if not has_common_scale(tasks, metric):
+        raise LareError(f"{metric} has no common scale over {', '.join(tasks)}: compare each task alone")
     sources: dict[str, tuple[Path, str]] = {}  # the first source of each task, and the task's digest
-    for result in results:
-        if result.config is not None:
-            other, digest = sources.setdefault(result.task, (result.source, result.config.task.digest))
-            if digest != result.config.task.digest:
+    for curve in results:
+        if curve.config is not None:
+            source, digest = sources.setdefault(curve.task, (curve.source, curve.config.task.digest))
+            if digest != curve.config.task.digest:
                 raise LareError(
-                    f"{result.source} and {other} have different tasks with the name {result.task}: compare them separately"
+                    f"{curve.source} and {source} have different tasks with the name {curve.task}: compare them separately"
                 )
 
 
 def _index_curves(results: Sequence[LearningCurve], metric: str) -> dict[_CurveKey, LearningCurve]:
     """Return the curves by key. Raise `LareError` if a curve has no value, or two have the same key."""
     curves: dict[_CurveKey, LearningCurve] = {}
-    # A table counts as draw 0. Its method lacks the other draws, so it cannot share a label with runs that have them.
-    run_sources = {result.label: result.source for result in reversed(results) if result.draw != 0}
-    for result in results:
-        source, label = result.source, result.label
-        if result.config is None and label in run_sources:
+    # A table has only draw 0, and a label needs every seed in every draw. So a table cannot share one with runs of further draws.
+    run_sources = {curve.label: curve.source for curve in reversed(results) if curve.draw != 0}
+    for curve in results:
+        source, label = curve.source, curve.label
+        if curve.config is None and label in run_sources:
             raise LareError(
                 f"{source} and {run_sources[label]} both have {label}, and a table has no draws: rename the method in the .csv file"
             )
-        other = curves.setdefault((label, result.task, result.draw, result.seed), result)
-        if other is not result:
-            hint = "" if result.config and other.config else ", or rename the method in the .csv file"
+        other = curves.setdefault((label, curve.task, curve.draw, curve.seed), curve)
+        if other is not curve:
+            hint = "" if curve.config and other.config else ", or rename the method in the .csv file"
             raise LareError(
-                f"{source} and {other.source} both have {label} on {result.task} with seed {result.seed} and draw {result.draw}: leave "
+                f"{source} and {other.source} both have {label} on {curve.task} with seed {curve.seed} and draw {curve.draw}: leave "
                 f"out one{hint}"
             )
-        if not result.values:
-            raise LareError(f"{source} has no {metric} of seed {result.seed}: leave it out")
+        if not curve.values:
+            raise LareError(f"{source} has no {metric} of seed {curve.seed}: leave it out")
     return curves
 
 

@@ -129,8 +129,7 @@ def _add_cases(
     v = jnp.where(is_case, v, 0)
     mean = weight @ v / jnp.maximum(n_new, 1)
     centred = jnp.where(is_case, v - mean, 0)
-    n_steps, merged, difference, fraction = merge_means(statistics.n_steps, statistics.mean, n_new, mean)
-    between = jnp.outer(difference, difference) * statistics.n_steps * fraction
+    n_steps, merged, between = merge_means(statistics.n_steps, statistics.mean, n_new, mean, lambda d: jnp.outer(d, d))
     return SufficientStatistics(
         n_episodes=statistics.n_episodes + n_episodes,
         n_steps=n_steps,

@@ -45,8 +45,7 @@ def add_returns(
     n_new = sums(jnp.ones_like(mean_reward))
     mean = sums(mean_reward) / jnp.maximum(n_new, 1)
     squares = sums((mean_reward - mean[jnp.minimum(slot, n_levels - 1)]) ** 2)
-    n_episodes, merged, difference, fraction = merge_means(means.n_episodes, means.mean, n_new, mean)
-    between = difference**2 * means.n_episodes * fraction
+    n_episodes, merged, between = merge_means(means.n_episodes, means.mean, n_new, mean)
     return LevelMeans(n_episodes, merged, means.sum_squares + squares + between)
 
 

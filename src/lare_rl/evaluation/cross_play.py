@@ -15,8 +15,8 @@ from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError, check_count
 from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import make_jax_env, unroll_on_device
-from lare_rl.training.policy import get_actor, make_policy
-from lare_rl.training.saved_state import load_learner
+from lare_rl.training.policy import make_policy
+from lare_rl.training.saved_state import load_actor
 
 __all__ = ["Match", "combine_policies", "cross_play"]
 
@@ -59,9 +59,8 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
 
 def _load_actors(run: Run) -> tuple[TrainConfig, list[Any]]:
     """Load the configuration, and the actor of each seed with an axis of one seed."""
-    state = load_learner(run)
-    actors = get_actor(state.learner.algorithm, run.config.settings.steps, state.config)
-    return state.config, [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], actors) for i in range(len(run.seeds))]
+    config, actors, _ = load_actor(run)
+    return config, [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], actors) for i in range(len(run.seeds))]
 
 
 def _play_match(

@@ -1,6 +1,5 @@
 """New episodes of a run's policy, with the credit of each agent, and samples of their steps."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
@@ -23,12 +22,11 @@ from lare_rl.training.decoder_inputs import compute_host_factors
 from lare_rl.training.episodes import predict_returns
 from lare_rl.training.evaluation import EpisodeBatch
 from lare_rl.training.learner import Learner, empty_replay, store_with_factors
-from lare_rl.training.policy import get_actor
 from lare_rl.training.rewards import rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.streams import Stream, episode_seed
-from lare_rl.training.unroll_host import policy_turns, record_on_host
+from lare_rl.training.unroll_host import policy_batches, record_on_host
 from lare_rl.util.statistics import column_correlations
 
 __all__ = [
@@ -86,8 +84,7 @@ def play_run(run: Run, n_episodes: int = 1, *, actor: Any = None, key: int = 0) 
     state = load_learner(run)
     config, learner = state.config, state.learner
     if actor is None:
-        first = jax.tree.map(lambda leaf: leaf[:1], learner.algorithm)
-        actor = get_actor(first, run.config.settings.steps, config)
+        actor = jax.tree.map(lambda leaf: leaf[:1], state.actor)
     if config.env.is_jax:
         batch = unroll_policy(make_jax_env(run.config.task), config, actor, n_episodes, key)
     else:
@@ -108,30 +105,28 @@ def play_run(run: Run, n_episodes: int = 1, *, actor: Any = None, key: int = 0) 
 def unroll_policy(env: JaxEnv, config: TrainConfig, actor: Any, n_episodes: int, key: int) -> EpisodeBatch:
     """Play whole episodes of a single seed's actor in one compiled call. The batch has no axis of seeds."""
     unroll = jax.jit(partial(unroll_on_device, env, n_episodes=n_episodes, config=config, deterministic=False))
-    return _drop_seed_axis(unroll(actor, jax.random.key(key)[None]))
+    return _repeat_last_steps(_drop_seed_axis(unroll(actor, jax.random.key(key)[None])), config.env.max_steps)
 
 
 def _unroll_on_host(run: Run, config: TrainConfig, actor: Any, n_episodes: int) -> EpisodeBatch:
     """Play as many episodes at a time as environments may be open. Their number does not affect an episode."""
     seeds, task, batches = run.seeds[:1], run.config.task, []
     with make_vec_env(task, n_open_envs(task, 1, n_episodes)) as envs:
-        for numbers, policy in policy_turns(envs, replace(config, deterministic=False), actor, seeds, n_episodes):
+        for numbers, policy in policy_batches(envs, replace(config, deterministic=False), actor, seeds, n_episodes):
             episode_seeds = [episode_seed(seeds[0], Stream.TRAINING_EPISODES, number) for number in numbers]
             batch = _drop_seed_axis(record_on_host(envs, policy, seeds, episode_seeds))
             batches.append(jax.tree.map(itemgetter(np.s_[:, : len(numbers)]), batch))
-    return _join_episodes(batches)
-
-
-def _join_episodes(batches: Sequence[EpisodeBatch]) -> EpisodeBatch:
-    """Join batches along the axis of episodes. The last step of a shorter batch is repeated, as that of an ended episode is."""
     n_steps = max(len(batch.mask) for batch in batches)
+    batches = [_repeat_last_steps(batch, n_steps) for batch in batches]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *batches)
 
-    def lengthen(batch: EpisodeBatch) -> EpisodeBatch:
-        steps = np.minimum(np.arange(n_steps), len(batch.mask) - 1)
-        batch = jax.tree.map(lambda leaf: leaf[steps], batch)
-        return batch._replace(mask=batch.mask & (np.arange(n_steps) == steps)[:, None])
 
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *map(lengthen, batches))
+def _repeat_last_steps(batch: EpisodeBatch, n_steps: int) -> EpisodeBatch:
+    """Return a batch of `n_steps` steps, with the last step of each episode repeated: after it, an environment may pay or show NaN."""
+    time = np.arange(n_steps)[:, None]
+    steps = np.minimum(time, batch.mask.sum(axis=0) - 1)
+    repeated = jax.tree.map(lambda leaf: leaf[steps, np.arange(steps.shape[1])], batch)
+    return repeated._replace(mask=time == steps)
 
 
 def _drop_seed_axis(batch: EpisodeBatch) -> EpisodeBatch:
@@ -144,7 +139,7 @@ def compute_training_rewards(
     """Compute the training rewards of whole episodes by the decoders of a single seed."""
     n_steps, n_episodes = np.shape(steps.next_timestep.terminated)
     # Rewards are computed from stored steps, so a new replay stores these episodes alone.
-    buffer = empty_replay(config, n_episodes, 2 * n_steps + 2)
+    buffer = empty_replay(config, n_episodes, 2 * n_steps + 2)  # a repeated last step is an episode of two rows
 
     @jax.jit
     def compute(steps: Trajectory, factors: Array) -> Array:
@@ -179,7 +174,7 @@ def sample_steps(run: Run, actor: Any = None) -> list[TeamSample]:
     played = play_run(run, N_SAMPLE_EPISODES, actor=actor, key=1)
     config, samples = played.config, []
     steps = jax.tree.map(lambda leaf: np.asarray(leaf)[played.mask], played.steps)  # [steps ...]
-    for team_index, role in enumerate(run.config.task.roles):
+    for team_index, role in enumerate(run.config.task.roles):  # its rows of all episodes, as if they were one
         rows = make_episode(role, config.env, steps.timestep, steps.env_action, steps.next_timestep)
         n_factors = config.n_factors[team_index] if config.n_factors else 0
         factors = played.factors[played.mask][:, config.team_slice(team_index), :n_factors]

@@ -22,7 +22,6 @@ from lare_rl.phi import evaluate
 from lare_rl.phi.graph import Gather, Graph, Node
 from lare_rl.phi.onnx import BATCH, DTYPES, is_onnx_installed, onnx_model
 from lare_rl.runs.directory import Run, as_run, function_filename
-from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_actor, load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.util.files import new_directory, replace_npz, write_bytes
@@ -60,15 +59,13 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
     seed_index, task, settings = run.seed_index(seed), run.config.task, run.config.settings
     if out.exists():
         raise LareError(f"{out} exists, and is not overwritten; choose another directory")
-    config, learner, host_state, _ = load_learner(run)
-    step = host_state["step"]
+    state = load_learner(run)
+    config, actors, step = state.config, state.actor, state.metadata["step"]
     if best:
         _, actors, best_steps = load_actor(run, best=True)
         step = int(best_steps[seed_index])
-    else:
-        actors = get_actor(learner.algorithm, step, config)
     graphs = {"policy": policy_graph(select_seed(actors, seed_index), config)}
-    decoders = select_seed(learner.decoders, seed_index)
+    decoders = select_seed(state.learner.decoders, seed_index)
     no_reward_reason = missing_reward_reason(config.method)
     if no_reward_reason is None:
         for team_index, role in enumerate(task.roles):

@@ -48,20 +48,19 @@ def update_mean_std(
     n_new, where = (len(rows), None) if mask is None else (jnp.sum(mask), mask[:, None])
     mean = jnp.sum(rows, axis=0, where=where) / jnp.maximum(n_new, 1)
     batch_squares = jnp.sum((rows - mean) ** 2, axis=0, where=where)
-    n_rows, merged, difference, fraction = merge_means(statistics.n_rows, statistics.mean, n_new, mean)
-    between = difference**2 * statistics.n_rows * fraction
+    n_rows, merged, between = merge_means(statistics.n_rows, statistics.mean, n_new, mean)
     return RunningMeanStd(n_rows, merged, statistics.sum_squares + batch_squares + between)
 
 
-def merge_means(n: Any, mean: Any, n_new: Any, new_mean: Any) -> tuple[Any, Any, Any, Any]:
-    """Return number and mean of old and new cases together, the difference d of the two means, and the fraction of new cases.
+def merge_means(n: Any, mean: Any, n_new: Any, new_mean: Any, square: Any = lambda d: d**2) -> tuple[Any, Any, Any]:
+    """Return the number and the mean of old and new cases together, and d^2 n n_new / (n + n_new), with d the difference of the means.
 
-    The squared deviations of all cases from the new mean are those within the old and the new ones, plus d^2 n fraction. This is the
+    The squared deviations from the merged mean are the sum of the last, and of those within the old and within the new cases. This is the
     parallel update of Chan, Golub and LeVeque (1983), which avoids catastrophic cancellation.
     """
     n_all, difference = n + n_new, new_mean - mean
     fraction = n_new / jnp.maximum(n_all, 1)
-    return n_all, mean + fraction * difference, difference, fraction
+    return n_all, mean + fraction * difference, square(difference) * n * fraction
 
 
 def running_std(statistics: RunningMeanStd) -> Float[Array, "*features"]:
@@ -71,7 +70,7 @@ def running_std(statistics: RunningMeanStd) -> Float[Array, "*features"]:
 
 
 def standardise(statistics: RunningMeanStd, rows: Float[Array, "*batch features"]) -> Float[Array, "*batch features"]:
-    """Return (x - mean) / std, clipped to ±10. A feature that has never varied becomes 0."""
+    """Return (x - mean) / std, clipped to ±`CLIP`. A feature that has never varied becomes 0."""
     std = running_std(statistics)
     scaled = (rows - statistics.mean) / jnp.where(std > 0, std, 1)
     return jnp.where(std > 0, jnp.clip(scaled, -CLIP, CLIP), 0)
@@ -85,7 +84,7 @@ def standardise_if_observed(
 
 
 class Scale(NamedTuple):
-    """The scale of a number that each episode has, such as its mean reward R/T."""
+    """Count, mean square, minimum and maximum of a number that each episode has, such as its mean reward R/T."""
 
     n_episodes: Float[Array, ""]
     mean_square: Float[Array, ""]

@@ -47,8 +47,9 @@ MAX_HOVERS = 60
 """The largest number of positions at which a chart shows its numbers."""
 MAX_LABEL = 24
 """The number of characters for which a chart has room at the end of a line."""
-_UNITS = 1000
-"""The width and the height of a chart in its own units."""
+_PERCENT = 10
+"""One percent of the width or the height of a chart, in its own units."""
+_UNITS = 100 * _PERCENT
 _Scale = Callable[[ArrayLike], np.ndarray]
 """A function from values to units of the chart."""
 _VIRIDIS = np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], float)
@@ -61,7 +62,7 @@ class Line:
     x: Float[np.ndarray, " points"]
     y: Float[np.ndarray, " points"]
     style: str
-    """Classes of report.css: a colour (`c0` to `c3`, `grey`), and perhaps `thin`, `dashed` or `other`."""
+    """Classes of report.css: a colour (`c0` to `c3`, `grey`), and perhaps `thin`, `dashed` or `faint`."""
     label: str = ""
     """The text at its end."""
     band: Float[np.ndarray, " points"] | None = None
@@ -79,11 +80,11 @@ class Chart:
     limits: tuple[float, float] | None = None
     """The ends of the y axis, where they are fixed."""
     hovers: Mapping[float, str] = field(default_factory=dict)
-    """Texts that appear at values of x."""
+    """Texts that appear at ascending values of x."""
     shaded_until: float = 0.0
     is_low: bool = False
     label_gap: float = 5.5
-    """Percent of the height between two labels: 9 for a chart among `figures`, which is lower."""
+    """Percent of the height between two labels. A lower chart needs more."""
 
     def render(self) -> str:
         """Return the chart as HTML."""
@@ -108,11 +109,11 @@ class Chart:
         texts = self._render_labels(scale_y)
         classes = f"chart{' low' if self.is_low else ''}{' labelled' if texts else ''}"
         texts += [
-            f'<span class="y" style="top:{y / 10:.1f}%">{label}</span>'
+            f'<span class="y" style="top:{y / _PERCENT:.1f}%">{label}</span>'
             for label, y in zip(tick_labels, scale_y(y_ticks), strict=True)
         ]
         texts += [
-            f'<span class="x" style="left:{x / 10:.1f}%">{format_for_reader(tick, "steps")}</span>'
+            f'<span class="x" style="left:{x / _PERCENT:.1f}%">{format_for_reader(tick, "steps")}</span>'
             for tick, x in zip(x_ticks, scale_x(x_ticks), strict=True)
         ]
         n_label = min(MAX_LABEL, max(len(line.label) for line in self.lines))
@@ -150,10 +151,10 @@ class Chart:
 
     def _render_labels(self, scale_y: _Scale) -> list[str]:
         labelled = [line for line in self.lines if line.label and np.isfinite(line.y).any()]
-        tops = _move_apart(scale_y([finite(line.y)[-1] for line in labelled]) / 10, self.label_gap)
+        tops = np.clip(scale_y([finite(line.y)[-1] for line in labelled]) / _PERCENT, 0, 100)
         return [
             f'<span class="label {line.style}" style="top:{y:.1f}%">{escape(line.label)}</span>'
-            for line, y in zip(labelled, tops, strict=True)
+            for line, y in zip(labelled, _move_apart(tops, self.label_gap), strict=True)
         ]
 
     def _render_hovers(self, scale_x: _Scale) -> list[str]:
@@ -161,7 +162,7 @@ class Chart:
         chosen = list(self.hovers.items())[::-step][::-1]  # counted from the last, so that it has a text
         centres = scale_x([x for x, _ in chosen])
         edges = np.concatenate([[0], (centres[1:] + centres[:-1]) / 2, [_UNITS]])
-        return [
+        return [  # `strict` would refuse a chart without texts, which has one interval
             f'<rect class="hover" x="{x:.0f}" width="{end - x:.0f}" height="{_UNITS}"><title>{escape(text)}</title></rect>'
             for (_, text), (x, end) in zip(chosen, pairwise(edges), strict=False)
         ]
@@ -196,7 +197,7 @@ def draw_legend(entries: Iterable[tuple[str, str]]) -> str:
 def draw_bars(bars: Sequence[Bar]) -> str:
     """Draw bars below each other, with their amounts as percentages."""
     amounts = [bar.amount for bar in bars]
-    low, high = min(0.0, *amounts), max(0.0, *amounts)
+    low, high = min([0.0, *amounts]), max([0.0, *amounts])
     extent = max(high - low, 1e-9)
     items = []
     for bar in bars:

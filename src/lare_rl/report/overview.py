@@ -255,7 +255,7 @@ def _draw_metric(
     colours: dict[str, str],
     warmup: int,
     random_mean: float | None = None,
-    label_gap: float = 5.5,
+    label_gap: float = Chart.label_gap,
 ) -> str:
     """Draw a metric of all runs: the mean over seeds and, of few runs, each seed. Return an empty text if no run has it."""
     curves = {reported.name: curve for reported in runs if (curve := reported.curve(metric.name))}
@@ -269,7 +269,7 @@ def _draw_metric(
             lines += [Line(steps, row, f"{colour} thin") for row in values]
         std = stds[name] if len(values) == 1 and n_coloured == 1 else None
         label = name if len(runs) > 1 and (colour != "grey" or len(runs) <= 2 * N_COLOURS) else ""
-        style = "grey other" if colour == "grey" else colour
+        style = "grey faint" if colour == "grey" else colour
         band = None if std is None else std[1][0]
         lines.append(Line(steps, mean_over_seeds(values), style, label=label, band=band))
     all_steps = np.concatenate([steps for steps, _ in curves.values()])
@@ -307,7 +307,7 @@ def _render_legend(runs: Sequence[ReportedRun], colours: dict[str, str], has_ran
     n_seeds = max(len(reported.run.seeds) for reported in runs)
     entries = [(colour, name) for name, colour in colours.items() if colour != "grey"]
     if n_grey := len(colours) - len(entries):
-        entries.append(("grey other", f"{n_grey} with lower returns"))
+        entries.append(("grey faint", f"{n_grey} with lower returns"))
     if n_seeds > 1 and len(runs) <= N_COLOURS:
         entries.append(("c0 thin" if len(runs) == 1 else "grey thin", "a seed"))
     if n_seeds == 1 and len(entries) == 1:

@@ -29,6 +29,11 @@ class SavedState(NamedTuple):
     arrays: dict[str, np.ndarray]
     """The other arrays of the session, by name."""
 
+    @property
+    def actor(self) -> Any:
+        """The actor of all seeds."""
+        return get_actor(self.learner.algorithm, self.metadata["step"], self.config)
+
 
 def load_learner(run: Run, n_devices: int = 1) -> SavedState:
     """Load the last checkpoint of a run. Its configuration spreads the seeds over `n_devices` devices.
@@ -59,6 +64,5 @@ def load_actor(run: Run, best: bool = False) -> tuple[TrainConfig, Any, Int[np.n
         config = make_train_config(run.config.task, run.config.settings, run.functions)
         best_policy = load_best(run.checkpoint, actor_shape(config, len(run.seeds)), len(run.seeds))
         return config, best_policy.actor, best_policy.step
-    config, learner, metadata, _ = load_learner(run)
-    step = metadata["step"]
-    return config, get_actor(learner.algorithm, step, config), np.full(len(run.seeds), step)
+    state = load_learner(run)
+    return state.config, state.actor, np.full(len(run.seeds), state.metadata["step"])

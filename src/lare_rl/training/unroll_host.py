@@ -21,9 +21,9 @@ from lare_rl.training.streams import Stream, episode_seed, numpy_generator
 __all__ = [
     "add_seed_axis",
     "evaluate_policy_on_host",
-    "evaluate_turn_on_host",
+    "evaluate_batch_on_host",
     "evaluation_policy",
-    "policy_turns",
+    "policy_batches",
     "record_on_host",
     "unroll_on_host",
 ]
@@ -80,7 +80,7 @@ def record_on_host(
     return EpisodeBatch(steps, mask, None)
 
 
-def evaluate_turn_on_host(
+def evaluate_batch_on_host(
     envs: VecEnv,
     policy: BatchPolicy,
     seeds: Sequence[int],
@@ -138,7 +138,7 @@ def evaluation_policy(
     return act
 
 
-def policy_turns(
+def policy_batches(
     envs: VecEnv, config: TrainConfig, actor: Any, seeds: Sequence[int], n_episodes: int
 ) -> Iterator[tuple[range, BatchPolicy]]:
     """Yield the numbers of the episodes that begin together, and their policy, until each seed has `n_episodes`.
@@ -171,8 +171,8 @@ def evaluate_policy_on_host(
         on_episode: called with the number of episodes that each seed has finished, after each turn.
     """
     evaluations = []
-    for numbers, policy in policy_turns(envs, config, actor, seeds, n_episodes):
-        evaluations.append(evaluate_turn_on_host(envs, policy, seeds, len(numbers), first + numbers.start, on_step))
+    for numbers, policy in policy_batches(envs, config, actor, seeds, n_episodes):
+        evaluations.append(evaluate_batch_on_host(envs, policy, seeds, len(numbers), first + numbers.start, on_step))
         on_episode(numbers.stop)
     return jax.tree.map(lambda *arrays: np.concatenate(arrays, axis=1), *evaluations)
 

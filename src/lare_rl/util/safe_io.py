@@ -6,8 +6,10 @@ These functions read the files of LaRe too, which may be damaged, or come from a
 import json
 import re
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from lare_rl.errors import LareError
 
@@ -15,6 +17,7 @@ __all__ = [
     "MAX_DEPTH",
     "MAX_SETTINGS_BYTES",
     "check_depth",
+    "open_file",
     "parse_integer",
     "read_json",
     "read_json_object",
@@ -40,22 +43,28 @@ _DEEP_NAME = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MAX_DEPTH}}}"
 """A dotted name (`a.b.c`) of more than `MAX_DEPTH` parts without quotes. TOML's parser takes quadratic time for such a name."""
 
 
+@contextmanager
+def open_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a file for reading. Raises `LareError` for an `OSError` or a `ValueError` until it is closed."""
+    try:
+        if path.exists() and not path.is_file():
+            raise LareError(f"{path} is not a file")
+        with path.open("rb") as file:
+            yield file
+    except (OSError, ValueError) as error:  # a path may hold a null character
+        raise LareError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
+
+
 def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
     r"""Read a text file in UTF-8. Lines of the result end with \n.
 
     Raises `LareError` if the file cannot be read, or is too large.
     """
-    try:
-        if path.exists() and not path.is_file():
-            raise LareError(f"{path} is not a file")
-        with path.open("rb") as file:
-            content = file.read(max_bytes + 1)
+    with open_file(path) as file:
+        content = file.read(max_bytes + 1)
         if len(content) > max_bytes:
             raise LareError(f"{path} is larger than {max_bytes >> 20} MB")
         return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
-    except (OSError, ValueError) as error:  # a path may hold a null character
-        reason = getattr(error, "strerror", None) or error
-        raise LareError(f"{path} cannot be read: {reason}") from error
 
 
 def read_json(text: str | bytes, strict: bool = True) -> Any:
