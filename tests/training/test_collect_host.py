@@ -23,7 +23,7 @@ from lare_rl.training.compiled import compile_functions, init_seeds
 from lare_rl.training.divergence import DivergedError
 from lare_rl.training.policy import get_actor
 from lare_rl.training.streams import Stream, episode_seed, seed_keys, stream_keys
-from lare_rl.training.unroll_host import evaluate_policy_on_host, evaluate_batch_on_host, record_on_host
+from lare_rl.training.unroll_host import evaluate_batch_on_host, evaluate_policy_on_host, record_on_host
 
 
 class Wrapped(gymnasium.Wrapper):

@@ -69,12 +69,12 @@ def _evaluate_graph(graph: Graph, observation: Array, action: Array) -> Float[Ar
     if is_compilable(graph):
         return evaluate(graph, {"observation": observation, "action": action}, jnp)["factors"]
 
-    def evaluate_batch_on_host(observation: Any, action: Any) -> np.ndarray:
+    def evaluate_on_host(observation: Any, action: Any) -> np.ndarray:
         inputs = {"observation": np.asarray(observation), "action": np.asarray(action)}
         return np.ascontiguousarray(evaluate(graph, inputs)["factors"])
 
     shape = jax.ShapeDtypeStruct((*observation.shape[:-1], graph.n_factors), jnp.float32)
-    return jax.pure_callback(evaluate_batch_on_host, shape, observation, action, vmap_method="broadcast_all")
+    return jax.pure_callback(evaluate_on_host, shape, observation, action, vmap_method="broadcast_all")
 
 
 def compute_host_factors(run: Run, config: CreditConfig, steps: Trajectory) -> Float[np.ndarray, "*lead rows factors"]:

@@ -20,8 +20,8 @@ from lare_rl.training.streams import Stream, episode_seed, numpy_generator
 
 __all__ = [
     "add_seed_axis",
-    "evaluate_policy_on_host",
     "evaluate_batch_on_host",
+    "evaluate_policy_on_host",
     "evaluation_policy",
     "policy_batches",
     "record_on_host",
@@ -88,7 +88,7 @@ def evaluate_batch_on_host(
     first: int = 0,
     on_step: Callable[[], None] = lambda: None,
 ) -> Evaluation:
-    """Evaluate one turn: an episode in each of the first `n_episodes` environments of each seed, each from a different initial state.
+    """Evaluate one batch: an episode in each of the first `n_episodes` environments of each seed, each from a different initial state.
 
     The initial states depend only on the seed and on the episode's number, which counts from `first`. So every evaluation of a
     run begins from the same ones, and no training episode does. `on_step` is called after each step of the environments.
@@ -143,7 +143,7 @@ def policy_batches(
 ) -> Iterator[tuple[range, BatchPolicy]]:
     """Yield the numbers of the episodes that begin together, and their policy, until each seed has `n_episodes`.
 
-    If a seed has fewer environments, its episodes take turns. The noise of an episode does not depend on that.
+    If a seed has fewer environments, there are several batches. The noise of an episode does not depend on that.
     """
     _, width = _batch_shape(envs, seeds)
     for start in range(0, n_episodes, width):
@@ -168,7 +168,7 @@ def evaluate_policy_on_host(
         actor: the actor of all seeds.
         first: the number of the first episode, which determines its initial state.
         on_step: called after each step of the environments.
-        on_episode: called with the number of episodes that each seed has finished, after each turn.
+        on_episode: called with the number of episodes that each seed has finished, after each batch.
     """
     evaluations = []
     for numbers, policy in policy_batches(envs, config, actor, seeds, n_episodes):
