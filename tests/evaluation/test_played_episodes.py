@@ -57,22 +57,26 @@ def played(run):
 
 
 class Broken(Echo):
-    """It shows and pays NaN after the end of an episode."""
+    """It shows and pays NaN after the end of an episode, and its state holds a random key."""
+
+    def reset(self, key):
+        state, timestep = super().reset(key)
+        return (state, key), timestep
 
     def step(self, state, action, key):
-        next_state, timestep = super().step(state, action, key)
-        ended = state.step >= state.length
+        next_state, timestep = super().step(state[0], action, key)
+        ended = state[0].step >= state[0].length
         values = {
             name: jnp.where(ended, jnp.nan, getattr(timestep, name)) for name in ("observation", "state", "reward")
         }
-        return next_state, timestep._replace(**values)
+        return (next_state, key), timestep._replace(**values)
 
 
 def test_steps_after_an_end_are_not_seen(run):
     state = load_learner(run)
     batch = unroll_policy(Broken(), state.config, jax.tree.map(lambda leaf: leaf[:1], state.actor), N_EPISODES, 0)
     assert len({int(n) for n in batch.mask.sum(axis=0)}) > 1
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(batch))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(batch.steps))
 
 
 def test_actor_is_that_of_the_checkpoint(tmp_path, monkeypatch):

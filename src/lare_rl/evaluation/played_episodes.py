@@ -130,7 +130,7 @@ def _repeat_last_steps(batch: EpisodeBatch, n_steps: int) -> EpisodeBatch:
 
 
 def _drop_seed_axis(batch: EpisodeBatch) -> EpisodeBatch:
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[:, 0], batch)
+    return jax.tree.map(lambda leaf: leaf[:, 0], jax.device_get(batch))
 
 
 def compute_training_rewards(
