@@ -35,7 +35,7 @@ test-short: $(VENV)/test ## Some of the tests, with little installed
 test-families: $(VENV)/families ## The tests of gymnax and JaxMARL, which need an older Gymnasium: in a VENV of their own, with CONSTRAINTS=
 	$(BIN)/python -m pytest -n 2 --dist worksteal tests/envs/test_gymnax_env.py tests/envs/test_jaxmarl_env.py tests/envs/test_jax_families.py
 
-test-long: setup ## The tests that repeat others with further algorithms, methods and tasks
+test-long: setup ## Slow tests, and those that repeat others with further algorithms, methods and tasks
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m long
 
 check: setup

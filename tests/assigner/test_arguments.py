@@ -6,7 +6,7 @@ import pytest
 from gymnasium import spaces
 
 from helpers.assigner_episodes import small_assigner
-from lare_rl.assigner.arguments import read_steps, to_levels, to_rows, to_step_ids
+from lare_rl.assigner.arguments import read_steps, to_levels, to_rows, to_score, to_step_ids
 from lare_rl.errors import LareError
 
 
@@ -28,6 +28,12 @@ def test_lists_are_needed():
             read([1, 2], env_ids=env_ids)
     with pytest.raises(LareError, match="group is 5: give a list"):
         to_levels(small_assigner(groups=True).config, 5, read([1, 2]), {})
+
+
+def test_score_is_a_single_number():
+    assert to_score(np.array([[2.0]]), "the score") == 2.0
+    with pytest.raises(LareError, match=r"the score is \[1\.0, 2\.0\].*single number"):
+        to_score([1.0, 2.0], "the score")
 
 
 @pytest.mark.parametrize("env_ids", [np.zeros((2, 1)), [([0],), 1], [float("nan"), 1]])

@@ -18,14 +18,15 @@ class MessageListener:
 
 
 class AtStep(MessageListener):
-    """Calls `action` when a run reaches `step`, and records the run's messages."""
+    """Calls `action` once, when a run reaches `step`, and records the run's messages."""
 
     def __init__(self, step, action):
         super().__init__()
-        self.step, self.action = step, action
+        self.step, self.action, self.is_due = step, action, True
 
     def on_step(self, step):
-        if step == self.step:
+        if step == self.step and self.is_due:
+            self.is_due = False
             self.action()
 
     def on_message(self, message):

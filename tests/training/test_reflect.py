@@ -125,8 +125,8 @@ def test_better_function_is_kept(episodes):
 @pytest.mark.long
 def test_episodes_of_policy():
     model = ScriptedModel(WRONG, RIGHT)
-    design_and_reflect(model, 1, policy=lambda observation: observation[:1] + 0.5)
-    episodes = play_episodes(TASK, N_EPISODES, lambda observation: observation[:1] + 0.5)
+    design_and_reflect(model, 1, policy=lambda observation: 0.5 * observation[:1])
+    episodes = play_episodes(TASK, N_EPISODES, lambda observation: 0.5 * observation[:1])
     assert assess(WRONG, episodes).ranges[0] in model.requests[1][-1]["content"]
 
 

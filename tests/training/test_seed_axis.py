@@ -59,7 +59,7 @@ def check_devices(expected_run, settings, tmp_path, n_devices):
 
 
 def read_numbers(line):
-    return [math.nan if value is None else value for value in line.values()]
+    return [math.nan if value is None else value for _, value in sorted(line.items())]
 
 
 @pytest.mark.long
@@ -79,7 +79,7 @@ FEW = {"environments": 2, "rollout_steps": 10, "steps": 80, "evaluate_every": 40
         (toy_spec(), {"algorithm": "td3", "method": "rrdu"}),
         ("CN-6", {"algorithm": "ippo", "method": "bayes"}),
         (echo_spec(), {"algorithm": "qmix", "method": "rd"}),
-        (echo_spec(), {"algorithm": "ippo", "method": "rd", "first_fit": "held-out", "environments": 16}),
+        (echo_spec(), {"algorithm": "ippo", "method": "rd", "first_fit": "held-out"}),
         (echo_spec(environment="hosted/three"), {"algorithm": "qmix", "method": "dense", "environments": 1}),
         (toy_spec(), {"algorithm": "sac", "method": "rrdu", "overlap_collection": True}),
     ],
