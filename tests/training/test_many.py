@@ -7,7 +7,6 @@ import pytest
 
 import lare_rl
 from helpers.jax_toy_envs import Echo
-from helpers.long_tests import long_case
 from helpers.small_configs import random_steps, small_config
 from helpers.training_runs import ECHO_PHI, train_quietly
 from lare_rl.config.resolve import resolve
@@ -48,9 +47,8 @@ def test_compute_factors_of_state(max_operations, echo, monkeypatch):
         np.testing.assert_allclose(z[..., 0, :], expected, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "method"), [long_case("qmix", "dense"), long_case("qmix", "lare-rd"), ("ippo", "lare-bayes")]
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("algorithm", "method"), [("qmix", "dense"), ("qmix", "lare-rd"), ("ippo", "lare-bayes")])
 def test_many_agents_learn_echo(algorithm, method, echo, tmp_path):
     """A random policy is right at less than half of the steps. An episode has 3 to 6 steps, 4.5 on average."""
     small = {"hidden": 16, "embed": 8, "hypernet": 8, "learning_rate": 5e-3, "batch_size": 32, "epsilon_steps": 2000}

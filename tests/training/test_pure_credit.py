@@ -93,6 +93,7 @@ def test_invalid_factors_are_counted_and_not_used(phi):
     assert float(state.learner.replay.episode_return.max()) != 0  # the reward of an invalid last step counts
 
 
+@pytest.mark.long
 def test_functions_are_mapped_over_seeds():
     """`vmap` within `shard_map` gives what single calls give: the rewards of many agents behind the returns."""
     settings = default_credit(3).model_copy(update={"score": "sum"})

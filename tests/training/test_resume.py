@@ -102,6 +102,7 @@ def test_resume_after_signal_is_exact(dense, dense_run, tmp_path):
     assert not (dense_run.checkpoint / "rows-1.npz").exists()
 
 
+@pytest.mark.long
 def test_resume_many_agents_on_device_is_exact(echo_settings, echo_run, tmp_path):
     """In the middle of episodes, after a signal; and between two checkpoints, after an error."""
     function = verify_function(ECHO_PHI, echo_spec())
