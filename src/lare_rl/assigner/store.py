@@ -38,7 +38,7 @@ class RunningEpisode:
     """An episode that has not ended."""
 
     step_ids: MutableSequence[int] = field(default_factory=partial(array, "q"))
-    """The numbers of its steps, of which there may be millions."""
+    """The numbers of its steps. There may be millions."""
     level: int = -1
     """-1 before a step has one."""
     n_paid: int = 0

@@ -29,7 +29,7 @@ from lare_rl.util.files import check_new_path, write_bytes
 __all__ = ["check_video_path", "encode_film", "record_frames", "record_video", "write_video"]
 
 MANY_AGENTS_FPS = 8
-"""Frames per second of a film of many agents."""
+"""Frames per second, if a film shows many agents."""
 MAX_GIF_FPS = 25.0
 """The most frames per second of a GIF, because drawing a frame may take long without a graphics card."""
 DEFAULT_FPS = 30

@@ -151,8 +151,10 @@ def symbol_attribute(owner_name: str, name: str) -> Any:
 @functools.lru_cache(maxsize=256)
 def _hint_or_near_name(full: str) -> str:
     """Return what to write instead of a name, as the end of a message. Empty if nothing is known."""
+    if hint := find_hint(full):
+        return hint
     near = difflib.get_close_matches(full, [*(f"np.{name}" for name in FUNCTIONS), *BUILTINS], 1, 0.8)
-    return find_hint(full) or (f": is {near[0]} meant?" if near else "")
+    return f": is {near[0]} meant?" if near else ""
 
 
 def _array_attribute(runtime: Runtime, array: Array, name: str) -> Any:
