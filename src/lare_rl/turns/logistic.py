@@ -50,9 +50,10 @@ def fit_logistic(
         curvature = np.maximum(p * (1 - p), MIN_CURVATURE)
         return sum_up(x, eta + (y - p) / curvature, weight * curvature, group, n_rollouts, unit=1.0)
 
-    def newton(eta: np.ndarray, alpha: np.ndarray, max_steps: int) -> tuple[np.ndarray, GroupSums, Elimination]:
-        """Return the log odds after Newton's steps, with the sums and the posterior of the last step."""
-        sums = regress(eta)
+    def newton(
+        eta: np.ndarray, sums: GroupSums, alpha: np.ndarray, max_steps: int
+    ) -> tuple[np.ndarray, GroupSums, Elimination]:
+        """Return the log odds after Newton's steps from `eta` and its sums, with the sums and the posterior of the last step."""
         posterior = eliminate_groups(sums, alpha, 1.0)
         mean = sums.problem.y_mean + posterior.weight[-1]
         step = mean + (x - sums.x_mean) @ posterior.weight[:-1] + posterior.intercept[group] - eta
@@ -60,12 +61,13 @@ def fit_logistic(
         eta = eta + step * min(1.0, MAX_STEP / max(largest, 1e-12))
         if largest < 1e-3 or max_steps == 1:
             return eta, sums, posterior
-        return newton(eta, alpha, max_steps - 1)
+        return newton(eta, regress(eta), alpha, max_steps - 1)
 
-    problem = regress(eta).problem
+    sums = regress(eta)
+    problem = sums.problem
     first_alpha = np.append(np.diagonal(problem.s) / problem.q * x.shape[1], 1.0) + 1e-12
     alpha, log_evidence = first_alpha, -np.inf
-    eta, sums, posterior = newton(eta, alpha, FIRST_STEPS)
+    eta, sums, posterior = newton(eta, sums, alpha, FIRST_STEPS)
     for _ in range(MAX_ROUNDS - 1):
         solution = np.concatenate([posterior.weight[:-1], posterior.intercept])
         moments = solution, posterior.variance, posterior.log_det
@@ -75,5 +77,5 @@ def fit_logistic(
         previous, log_evidence = log_evidence, weight @ (y * np.log(p) + (1 - y) * np.log(1 - p)) + log_occam
         if abs(log_evidence - previous) <= 10 * TOLERANCE:
             break
-        eta, sums, posterior = newton(eta, alpha, NEXT_STEPS)
+        eta, sums, posterior = newton(eta, regress(eta), alpha, NEXT_STEPS)
     return to_fit(sums, posterior, 1.0, is_logistic=True)
