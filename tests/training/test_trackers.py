@@ -43,6 +43,23 @@ def test_mlflow_gets_every_number(dense_run, tmp_path, monkeypatch):
     assert set(first_runs.values()).isdisjoint(listener.runs.values())  # another training has other runs
 
 
+def test_failing_service_is_a_warning(dense_run, tmp_path, monkeypatch):
+    monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
+    listener = MLflow("toys", (tmp_path / "mlruns").as_uri())
+    lines = dense_run.metrics()[:2]
+    listener.on_start("Chase dense", 0, 240)
+    monkeypatch.setattr(listener, "metric", "no class")
+    with pytest.warns(RuntimeWarning, match=r"MLflow .*not callable.*metrics\.jsonl"):
+        listener.on_evaluation(lines)
+    n_runs = len(listener.runs)
+    listener.on_evaluation(lines)  # without another warning
+    listener.on_stop()
+    assert len(listener.runs) == n_runs
+    listener.on_start("Chase dense", 0, 240)  # another training tries again
+    with pytest.warns(RuntimeWarning):
+        listener.on_evaluation(lines)
+
+
 @pytest.mark.long
 def test_wandb_gets_every_number(dense_run, tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_SILENT", "true")

@@ -4,17 +4,43 @@
 
 The service's own settings decide where it stores them, and whether it is reached at all (`WANDB_MODE=offline`,
 `MLFLOW_TRACKING_URI`). A resumed run continues in new runs of the service, from the step of its checkpoint.
+
+If a service fails, training goes on without it, after a warning: metrics.jsonl has every number.
 """
 
 import inspect
 import time
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Mapping
+from functools import wraps
 from typing import Any
 
 from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.training.progress import Listener, MetricLines, known_numbers
+from lare_rl.util.sanitize import one_line
 
 __all__ = ["MLflow", "WeightsAndBiases"]
+
+
+def _survive_failures(method: Callable[..., None]) -> Callable[..., None]:
+    """Let a tracker's method do nothing once the service has failed. The first failure is a warning."""
+
+    @wraps(method)
+    def call(self: Any, *arguments: Any) -> None:
+        if self.has_failed:
+            return
+        try:
+            method(self, *arguments)
+        except Exception as error:  # each service raises errors of its own, and those of the network
+            self.has_failed = True
+            name = type(self).__name__
+            warnings.warn(
+                f"{name} gets no more numbers, because it failed: {one_line(error)}. metrics.jsonl has every number",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+
+    return call
 
 
 class WeightsAndBiases(Listener):
@@ -34,13 +60,14 @@ class WeightsAndBiases(Listener):
             raise missing_extra_error("Weights & Biases", "wandb") from None
         except TypeError as error:
             raise LareError(f"wandb.init cannot be called with these arguments: {error}") from None
-        self.init, self.arguments, self.name = wandb.init, arguments, ""
+        self.init, self.arguments, self.name, self.has_failed = wandb.init, arguments, "", False
         self.runs: dict[int, Any] = {}
         """The service's runs, by seed."""
 
     def on_start(self, name: str, step: int, steps: int) -> None:
-        self.name, self.runs = name, {}  # the listener may have been used before
+        self.name, self.runs, self.has_failed = name, {}, False  # the listener may have been used before
 
+    @_survive_failures
     def on_evaluation(self, metrics: MetricLines) -> None:
         for line in metrics:
             seed = line["seed"]
@@ -49,6 +76,7 @@ class WeightsAndBiases(Listener):
                 self.runs[seed] = self.init(reinit="create_new", **arguments)
             self.runs[seed].log(known_numbers(line), step=line["step"])
 
+    @_survive_failures
     def on_stop(self) -> None:
         for run in self.runs.values():
             run.finish()
@@ -83,13 +111,14 @@ class MLflow(Listener):
             self.experiment = existing.experiment_id if existing else self.client.create_experiment(experiment)
         except MlflowException as error:
             raise LareError(f"MLflow cannot be used: {error}") from error
-        self.name = ""
+        self.name, self.has_failed = "", False
         self.runs: dict[int, str] = {}
         """The ids of the service's runs, by seed."""
 
     def on_start(self, name: str, step: int, steps: int) -> None:
-        self.name, self.runs = name, {}  # the listener may have been used before
+        self.name, self.runs, self.has_failed = name, {}, False  # the listener may have been used before
 
+    @_survive_failures
     def on_evaluation(self, metrics: MetricLines) -> None:
         now_ms = int(1000 * time.time())
         for line in metrics:
@@ -101,6 +130,7 @@ class MLflow(Listener):
             numbers = [self.metric(key, value, now_ms, line["step"]) for key, value in known_numbers(line).items()]
             self.client.log_batch(self.runs[seed], metrics=numbers)
 
+    @_survive_failures
     def on_stop(self) -> None:
         for run in self.runs.values():
             self.client.set_terminated(run)

@@ -54,14 +54,16 @@ def fit_logistic(
         eta: np.ndarray, sums: GroupSums, alpha: np.ndarray, max_steps: int
     ) -> tuple[np.ndarray, GroupSums, Elimination]:
         """Return the log odds after Newton's steps from `eta` and its sums, with the sums and the posterior of the last step."""
-        posterior = eliminate_groups(sums, alpha, 1.0)
-        mean = sums.problem.y_mean + posterior.weight[-1]
-        step = mean + (x - sums.x_mean) @ posterior.weight[:-1] + posterior.intercept[group] - eta
-        largest = np.abs(step).max()
-        eta = eta + step * min(1.0, MAX_STEP / max(largest, 1e-12))
-        if largest < 1e-3 or max_steps == 1:
-            return eta, sums, posterior
-        return newton(eta, regress(eta), alpha, max_steps - 1)
+        while True:
+            posterior = eliminate_groups(sums, alpha, 1.0)
+            mean = sums.problem.y_mean + posterior.weight[-1]
+            step = mean + (x - sums.x_mean) @ posterior.weight[:-1] + posterior.intercept[group] - eta
+            largest = np.abs(step).max()
+            eta = eta + step * min(1.0, MAX_STEP / max(largest, 1e-12))
+            max_steps -= 1
+            if largest < 1e-3 or not max_steps:
+                return eta, sums, posterior
+            sums = regress(eta)
 
     sums = regress(eta)
     problem = sums.problem
