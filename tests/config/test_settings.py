@@ -7,7 +7,7 @@ import pytest
 from helpers.toy_envs import pick_spec
 from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.algorithms.registry import ALGORITHMS
-from lare_rl.config.effective import effective_settings, unused_settings, warmup_warning
+from lare_rl.config.effective import describe_unused_settings, effective_settings, warmup_warning
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.credit.decoder_settings import CreditSettings
@@ -96,13 +96,13 @@ def test_resolved_settings_round_trip(task, algorithm):
 def test_unused_settings(task, settings, names):
     spec, settings = read_task(task), Settings(**settings)
     resolved = resolve(settings, spec)
-    assert sorted(unused_settings(settings, resolved, spec)) == sorted(names)
+    assert sorted(describe_unused_settings(settings, resolved, spec)) == sorted(names)
     assert not set(names) & set(effective_settings(resolved))
 
 
 def test_messages_of_unused_settings_and_warmup():
     settings = Settings(method="dense", td3={"gamma": 0.5, "tau": 0.5}, scale_rewards=True, credit={"steps": 70})
-    messages = unused_settings(settings, resolve(settings, pick_spec()), pick_spec())
+    messages = describe_unused_settings(settings, resolve(settings, pick_spec()), pick_spec())
     expected = {"td3.gamma": "ppo.gamma", "td3.tau": "ppo", "scale_rewards": "ppo", "credit.steps": "dense"}
     assert messages.keys() == expected.keys()
     assert all(
@@ -110,6 +110,6 @@ def test_messages_of_unused_settings_and_warmup():
     )
     assert frozenset().union(*(method.settings for method in METHODS.values())) == set(CreditSettings.model_fields)
     settings = Settings(steps=10_000, algorithm="td3", td3={"warmup": 9_990})
-    assert "10,000 are (td3.warmup)" in (warmup_warning(resolve(settings, read_task("Reacher-v4"))) or "")
+    assert "10,000 steps are random (td3.warmup)" in (warmup_warning(resolve(settings, read_task("Reacher-v4"))) or "")
     longer = settings.model_copy(update={"steps": 10_050})
     assert warmup_warning(resolve(longer, read_task("Reacher-v4"))) is None

@@ -101,6 +101,16 @@ def test_sample_packed(buffer, steps, rows):
     assert len({tuple(first) for first in samples.episodes.first.number.tolist()}) == 24
 
 
+def test_sample_packed_of_many_steps(buffer):
+    """The number of steps times the number of episodes may exceed 32 bits."""
+    n_episodes, n_steps, steps = len(FIRST), sum(length for length, _ in FIRST.values()), 2**28
+    assert steps * n_episodes > 2**31
+    sample = jax.eval_shape(lambda: sampling.sample_packed(buffer, jax.random.key(0), 1, steps, 8))
+    assert sample.episodes.mask.shape == (1, steps)
+    assert int(sampling.n_packed_episodes(buffer, steps)) == pytest.approx(steps * n_episodes / n_steps, rel=1e-5)
+    assert int(sampling.n_packed_episodes(buffer, n_steps)) == n_episodes
+
+
 def test_episodes_in_order(buffer):
     since = jnp.array([0, buffer.current_episode[1] - 2, 100])  # all that are stored, the newest two, and none
     stored = [[first for first in FIRST if first[0] == env] for env in (0, 1)]

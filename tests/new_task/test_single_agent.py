@@ -10,7 +10,13 @@ from lare_rl.envs.load import load_task
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.llm.prompts import candidate
-from lare_rl.new_task.documentation import plain_lines, remove_rewards
+from lare_rl.new_task.documentation import (
+    plain_lines,
+    remove_rewards,
+    single_agent_lines,
+    split_sections,
+    unused_titles,
+)
 from lare_rl.new_task.draft import make_draft
 from lare_rl.new_task.single_agent import draft_task
 from lare_rl.tasks.spec import FILL_IN
@@ -100,6 +106,28 @@ def test_plain_lines():
     assert plain_lines(text) == [*table, "0: floor", "1 to 2: waiting people, by floor"]
 
 
+def test_episode_ends_of_real_environments():
+    draft = draft_task("Hopper-v5")
+    assert "height of the hopper" in draft.toml.partition("observation = \"\"\"")[0]
+    assert not any("termination" in title for title in draft.unused_sections)
+    draft = draft_task("CarRacing-v3")
+    assert any("-100 reward" in line for line in draft.removed)
+
+
+def test_comparisons_are_no_markup():
+    sections = split_sections(
+        "The pole is up if a < 3 and b > 5.<br>\nOver.\n# Code\n```python\n# a comment\nx = 1\n```"
+    )
+    assert sections == {"": "The pole is up if a < 3 and b > 5.\nOver.\n", "code": ""}
+
+
+def test_sections_about_the_same():
+    sections = split_sections("# Observation Space\nA.\n# Observations\nB.\n# Observation space\nC.")
+    lines = single_agent_lines(sections)
+    assert lines["observation"] == ["A.", "C."]
+    assert unused_titles(sections) == ("observations",)
+
+
 def test_first_line_is_not_repeated():
     texts = {"observation": "3 entries: speeds", "action": "31 entries: forces"}
     heads = {"observation": "3 entries.", "action": "3 entries, each between -1 and 1."}
@@ -168,6 +196,8 @@ def test_words_of_drafts(name, words):
         ("It is worth +10 points.", True),
         ("The goal is to maximise the expected return.", True),
         ("Be quick, since a penalty is due.", True),
+        ("The agent gets a bonus of 10 for each apple.", True),
+        ("The fitness is the distance.", True),
         ("A mark 0..100 at the end.", True),
         ("The final grade (0 to 10) depends on the level.", True),
         ("A fixed point in the plane.", False),

@@ -49,9 +49,9 @@ def test_standardise():
         rows = jnp.full((50, 1), constant)
         assert not standardise(update_mean_std(observe(rows), rows), rows).any()
     rows, statistics = jnp.array([[3.0, -70.0]]), observe(np.array([[1.0, 2.0], [3.0, 6.0]], np.float32))
-    np.testing.assert_array_equal(normalise.standardise_if_observed(normalise.empty_mean_std(2), rows), rows)
+    np.testing.assert_array_equal(normalise.standardise_unless_empty(normalise.empty_mean_std(2), rows), rows)
     want = standardise(statistics, rows)
-    np.testing.assert_array_equal(normalise.standardise_if_observed(statistics, rows), want)
+    np.testing.assert_array_equal(normalise.standardise_unless_empty(statistics, rows), want)
 
 
 def test_scale():

@@ -166,3 +166,11 @@ def test_larger_replay_and_missing_arrays(tmp_path):
     assert filled.closed_form.strengths.weight.tolist() == [0, 0, 0]
     with pytest.raises(ValueError, match="weight is missing"):
         checkpoint.fill_template(state, {})
+
+    class Fitted(NamedTuple):
+        statistics: Closed
+
+    fitted = Fitted(Closed(jnp.ones(1), jnp.ones(2)))  # a method that fits nothing had no statistics
+    assert checkpoint.fill_template(fitted, {}).statistics.weight.tolist() == [0, 0]
+    with pytest.raises(ValueError, match="weight is missing"):
+        checkpoint.fill_template(fitted, {".statistics.strengths": np.ones(1, np.float32)})

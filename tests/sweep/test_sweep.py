@@ -18,7 +18,7 @@ import lare_rl
 from helpers import untrained_runs
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
-from lare_rl.sweep.jobs import job_to_json, train_job
+from lare_rl.sweep.jobs import describe_job, train_job
 from lare_rl.sweep.processes import RunningProcesses, train_in_process
 from lare_rl.sweep.resources import Slot
 from lare_rl.sweep.sweep import read_sweep, run_sweep
@@ -293,11 +293,11 @@ def test_functions_instead_of_draws(file, tmp_path):
     write_run(jobs[1], functions=(first,))
     assert read_sweep(file)[1][1].done
     with pytest.raises(LareError, match=r"latent_function\.py"):  # a run that has begun is resumed
-        train_job(job_to_json(jobs[1]))
+        train_job(describe_job(jobs[1]))
     for name in ("phi.py", "phi.json"):
         (tmp_path / name).unlink()
     with pytest.raises(LareError, match=r"phi\.py"):
-        train_job(job_to_json(jobs[1]) | {"directory": str(tmp_path / "other")})
+        train_job(describe_job(jobs[1]) | {"directory": str(tmp_path / "other")})
     second.save(tmp_path / "phi.py")
     with pytest.raises(LareError, match="lare-linear-td3 holds a run with another latent function"):
         read_sweep(file)
@@ -307,7 +307,10 @@ def test_directory_of_another_run(file):
     jobs = read_sweep(file)[1]
     write_run(jobs[0])
     file.write_text(FILE.replace("steps = 200", "steps = 400"))
-    with pytest.raises(LareError, match="dense-td3 holds a run with steps = 200, not 400"):
+    with pytest.raises(LareError, match=r"dense-td3 holds a run with steps = 200, not 400: .*--resume \S+ --steps 400"):
+        read_sweep(file)
+    file.write_text(FILE.replace("steps = 200", "steps = 120"))
+    with pytest.raises(LareError, match=r"not 150: (?!.*--resume)"):
         read_sweep(file)
     for change in (
         'algorithms = ["td3", "sac"]' + FILE + "sac = { gamma = 0.9 }\n",

@@ -176,7 +176,7 @@ def test_module_that_a_new_process_would_not_trust(monkeypatch):
 def test_train_ends_with_a_command_that_can_be_copied(write_run, command, monkeypatch):
     """A new process trusts only what it is told to."""
     directory = write_run("helpers.toy_envs:toys/Chase-v0")
-    monkeypatch.setattr(lare_rl, "resume", lambda path, **_: open_run(path))
+    monkeypatch.setattr(lare_rl, "resume", lambda run, **_: run)
     assert command("train", "--resume", directory)[1].endswith(
         f": LARE_TRUST=helpers.toy_envs lare-rl report {directory}\n"
     )

@@ -43,11 +43,16 @@ def test_cache_variables(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "environment",
-    [{"LARE_CACHE": "off"}, {"LARE_CACHE": " off "}, {"JAX_COMPILATION_CACHE_DIR": "other"}, {"LARE_CACHE": __file__}],
+    "variables",
+    [{"LARE_CACHE": "off"}, {"LARE_CACHE": " OFF "}, {"JAX_COMPILATION_CACHE_DIR": "other"}, {"LARE_CACHE": __file__}],
 )
-def test_no_cache(environment):
-    assert cache_variables(environment) == {}
+def test_no_cache(variables):
+    assert cache_variables(variables) == {}
+
+
+def test_home_directory(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert Path(cache_variables({"LARE_CACHE": "~/own"})["JAX_COMPILATION_CACHE_DIR"]).parent == tmp_path / "own"
 
 
 def test_incomplete_programs_are_removed(tmp_path):

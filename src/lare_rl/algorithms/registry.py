@@ -36,6 +36,11 @@ __all__ = [
 class AlgorithmSettings(CheckedModel):
     """The base class of an algorithm's hyperparameters."""
 
+    @property
+    def unused_names(self) -> tuple[str, ...]:
+        """The names of hyperparameters that make no difference because of the values of others."""
+        return ()
+
 
 class SequenceSettings(AlgorithmSettings):
     """The base class of the hyperparameters of an algorithm that consumes whole episodes."""

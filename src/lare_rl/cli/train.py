@@ -1,5 +1,6 @@
 """The command `train`."""
 
+import shlex
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -10,7 +11,7 @@ from tyro.conf import Positional
 from tyro.constructors import PrimitiveConstructorSpec
 
 from lare_rl.cli.terminal import print_line, print_progress
-from lare_rl.config.effective import unused_settings
+from lare_rl.config.effective import describe_unused_settings
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.errors import LareError
 from lare_rl.runs.plan import RunPlan, load_config
@@ -31,7 +32,7 @@ _READ_PLAN = PrimitiveConstructorSpec(
     is_instance=lambda value: value is None or isinstance(value, RunPlan),
     str_from_instance=lambda plan: [str(plan)],
 )
-"""Reads the file or run of --config once, so that options can change its settings."""
+"""Reads the file or the run that --config names. `cli/parse.py` then puts the options of the command line over its settings."""
 
 
 def train(
@@ -76,9 +77,13 @@ def train(
 
         options = (task, function, out, config, settings.model_copy(update={"steps": None}))
         if options != (None, (), None, None, DEFAULTS):
-            raise LareError("--resume uses the run's settings: give it no task, and no setting but --steps")
-        directory, run_settings = resume, open_run(resume).config.settings
-        start = partial(lare_rl.resume, resume, steps=settings.steps)
+            raise LareError(
+                "--resume continues a run in its directory, with its own task, settings and functions: leave out TASK, --function, "
+                "--out, --config and all settings but --steps"
+            )
+        stopped = open_run(resume)
+        directory, run_settings = resume, stopped.config.settings
+        start = partial(lare_rl.resume, stopped, steps=settings.steps)
     elif chosen_task is None:
         raise LareError(
             f"there is no task{f' in {plan.source}' if config else ''}: use lare-rl train TASK (lare-rl tasks lists them), "
@@ -90,7 +95,7 @@ def train(
     run = start(tensorboard=tensorboard, listeners=listeners)
     module = module_to_trust(run.config.task)
     trust = f"{TRUST_VARIABLE}={module} " if module else ""
-    print_line(f"finished {run.directory}; to see it: {trust}lare-rl report {run.directory}")
+    print_line(f"finished {run.directory}; to see it: {trust}lare-rl report {shlex.quote(str(run.directory))}")
 
 
 def _prepare(
@@ -104,8 +109,9 @@ def _prepare(
 
     spec = resolve_task(task)
     resolved = resolve(settings, spec)
-    for name, warning in unused_settings(settings, resolved, spec).items():
-        if not (plan.is_run and plan.has(name, settings)):
+    for name, warning in describe_unused_settings(settings, resolved, spec).items():
+        # A run that is repeated lists all of its settings. Those that make no difference are no mistake of the user.
+        if not (plan.is_run and plan.has_same_value(name, settings)):
             raise LareError(f"{warning}: leave the setting out")
     files = function or plan.function_for(resolved)
     functions = _load_functions(files, spec, resolved) if files else None
@@ -134,16 +140,19 @@ def _listeners(wandb: str | None, mlflow: str | None, settings: ResolvedSettings
     from lare_rl.training.trackers import MLflow, WeightsAndBiases
 
     listeners: list[Listener] = [Terminal()]
-    config = settings.model_dump(mode="json")
+    values = settings.model_dump(mode="json")
     if wandb is not None:
-        listeners.append(WeightsAndBiases(project=wandb, config=config))
+        listeners.append(WeightsAndBiases(project=wandb, config=values))
     if mlflow is not None:
-        listeners.append(MLflow(mlflow, parameters=config))
+        listeners.append(MLflow(mlflow, parameters=values))
     return listeners
 
 
 def _live_page(directory: Path, watch: bool) -> "list[Listener]":
-    """Return the page that shows the run, if it is requested now, or was requested before the run was stopped."""
+    """Return a list with the page that shows the run, or an empty list.
+
+    The page is written if `watch` is true, or if the directory already has one.
+    """
     if not watch and not directory.exists():
         return []
     from lare_rl.report.live_page import PAGE, LivePage

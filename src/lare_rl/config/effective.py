@@ -9,20 +9,34 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS, Method
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["effective_settings", "fits_separately", "needs_replay", "unused_names", "unused_settings", "warmup_warning"]
+__all__ = [
+    "describe_unused_settings",
+    "dump_by_algorithm",
+    "effective_settings",
+    "fits_separately",
+    "reads_old_steps",
+    "unused_names",
+    "warmup_warning",
+]
 
 
 def effective_settings(settings: ResolvedSettings) -> dict[str, Any]:
     """Return the settings that a run uses, by dotted names as on the command line."""
-    values = settings.model_dump()
+    values = dump_by_algorithm(settings)
     if settings.scored_observation is None:
         values["scored_observation"] = "as the task says"
-    values[settings.algorithm] = values.pop("hyperparameters")
     unused = unused_names(settings)
     return {name: value for name, value in _flatten(values) if not _is_under(name, unused)}
 
 
-def unused_settings(settings: Settings, resolved: ResolvedSettings, task: TaskSpec) -> dict[str, str]:
+def dump_by_algorithm(settings: ResolvedSettings) -> dict[str, Any]:
+    """Return all settings as plain data. The hyperparameters are under the name of their algorithm, as in `Settings`."""
+    values = settings.model_dump()
+    values[settings.algorithm] = values.pop("hyperparameters")
+    return values
+
+
+def describe_unused_settings(settings: Settings, resolved: ResolvedSettings, task: TaskSpec) -> dict[str, str]:
     """Return a message about each setting that a user changed and the run does not use, by dotted names."""
     defaults, effective = dict(_flatten(Settings().model_dump())), effective_settings(resolved)
     other_algorithms = [name for name in ALGORITHMS if name != resolved.algorithm]
@@ -45,7 +59,6 @@ def unused_names(settings: ResolvedSettings) -> list[str]:
     method, algorithm = METHODS.find(settings.method), ALGORITHMS[settings.algorithm]
     on_policy = algorithm.consumes is Consumes.ROLLOUTS
     has_fits = fits_separately(method, algorithm.consumes)
-    has_mixer = getattr(settings.hyperparameters, "monotonic", True)
     is_used = {
         "fit_every": has_fits,
         "fit_updates": has_fits,
@@ -53,22 +66,20 @@ def unused_names(settings: ResolvedSettings) -> list[str]:
         "scored_observation": method.uses_scored_observation,
         "draw": method.needs_phi,
         "candidates": method.needs_phi,
-        "capacity": needs_replay(settings),
+        "capacity": reads_old_steps(settings),
         "scale_rewards": not on_policy,
-        f"{settings.algorithm}.noise_clip": getattr(settings.hyperparameters, "policy_noise", None) != 0,
-        f"{settings.algorithm}.embed": has_mixer,
-        f"{settings.algorithm}.hypernet": has_mixer,
     }
+    is_used |= {f"{settings.algorithm}.{name}": False for name in settings.hyperparameters.unused_names}
     is_used |= {f"credit.{name}": name in method.settings for name in CreditSettings.model_fields}
     return [name for name, used in is_used.items() if not used]
 
 
 def fits_separately(method: Method, consumes: Consumes) -> bool:
-    """Return whether the decoder makes gradient updates of its own between iterations, not one with each of the algorithm's."""
-    return method.uses_gradient and (consumes is Consumes.ROLLOUTS or (method.fit is not None and method.fit.separate))
+    """Return whether the gradient updates of the decoder run between iterations. Else each update of the algorithm has one."""
+    return method.uses_gradient and (consumes is Consumes.ROLLOUTS or method.has_separate_fit)
 
 
-def needs_replay(settings: ResolvedSettings) -> bool:
+def reads_old_steps(settings: ResolvedSettings) -> bool:
     """Return whether updates read steps of earlier iterations."""
     consumes = ALGORITHMS[settings.algorithm].consumes
     return consumes is not Consumes.ROLLOUTS or METHODS.find(settings.method).fit is not None
@@ -80,8 +91,8 @@ def warmup_warning(settings: ResolvedSettings) -> str | None:
         return None
     name = f"{settings.algorithm}.warmup"
     return (
-        f"all {settings.steps:,} steps are random, as the first {settings.warmup:,} are ({name}), and the policy is not trained: use "
-        f"more steps or a smaller {name}"
+        f"the policy is never trained: the first {settings.warmup:,} steps are random ({name}), and the run has {settings.steps:,}. "
+        f"Use more steps or a smaller {name}"
     )
 
 

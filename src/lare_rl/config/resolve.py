@@ -3,7 +3,7 @@
 from typing import Any
 
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm, Consumes
-from lare_rl.config.effective import needs_replay, unused_names
+from lare_rl.config.effective import reads_old_steps, unused_names
 from lare_rl.config.settings import ResolvedSettings, Settings, round_up
 from lare_rl.config.train_config import make_train_config
 from lare_rl.config.validity import check_training
@@ -92,7 +92,7 @@ def _apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
     evaluate_every = round_up(settings.evaluate_every or n_iterations * iteration, iteration)
 
     method = METHODS.find(values["method"])
-    if settings.fit_updates is None and method.fit is not None and method.fit.separate:
+    if settings.fit_updates is None and method.has_separate_fit:
         values["fit_updates"] = max(1, iteration // 50)
     credit = MULTI_AGENT_CREDIT if algorithm.multi_agent else CreditSettings()
     credit_changes = settings.credit.model_dump(exclude_unset=True) if settings.credit else {}
@@ -150,7 +150,7 @@ def _check_size(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Non
             f"environments = {resolved.environments} needs at least {min_steps}"
         )
     min_capacity = required_capacity(resolved.rollout_steps, env.max_steps) * resolved.environments
-    if needs_replay(resolved) and resolved.capacity < min_capacity:
+    if reads_old_steps(resolved) and resolved.capacity < min_capacity:
         data = "a rollout" if ALGORITHMS[resolved.algorithm].consumes is Consumes.ROLLOUTS else "an iteration"
         raise LareError(
             f"capacity = {resolved.capacity} is too small: {data} of {task.name} takes up to {min_capacity}"

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm, AlgorithmSettings, Consumes, Noise
-from lare_rl.config.effective import fits_separately, needs_replay
+from lare_rl.config.effective import fits_separately, reads_old_steps
 from lare_rl.config.settings import ResolvedSettings
 from lare_rl.credit.decoder_settings import RECENT_STEPS, CreditSettings
 from lare_rl.credit.methods import METHODS, Method
@@ -239,7 +239,7 @@ def replay_rows(settings: ResolvedSettings, max_steps: int) -> int:
     """Return the rows of the replay for each environment. An episode has up to `max_steps` steps."""
     required = required_capacity(settings.rollout_steps, max_steps)
     rows = settings.capacity // settings.environments
-    if not needs_replay(settings):  # only to compare the newest rewards with the true ones
+    if not reads_old_steps(settings):  # only to compare the newest rewards with the true ones
         rows = required + RECENT_STEPS // settings.environments
     all_rows = (
         2 * settings.steps // settings.environments + 2

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lare_rl.credit import closed_form
 from lare_rl.credit.closed_form import ClosedForm
 from lare_rl.credit.decoder_network import DecoderNetwork, DecoderOutput, FirstInput
-from lare_rl.credit.levels import LevelMeans, add_returns, empty_level_means, level_offsets
+from lare_rl.credit.levels import LevelStatistics, add_mean_rewards, empty_level_statistics, level_offsets
 from lare_rl.credit.methods import Fit
 from lare_rl.credit.prequential import Predictions, empty_predictions
 from lare_rl.credit.score_type import ScoreType
@@ -116,7 +116,7 @@ class DecoderState(NamedTuple):
     """Predictions of returns by the current decoder."""
     closed_form: ClosedForm | None
     """Present for a decoder in closed form, and for any decoder if the score type must be determined."""
-    levels: LevelMeans | None
+    levels: LevelStatistics | None
     """Means of R/T by level. Present for a decoder that is fitted by gradient descent, if episodes have levels."""
     score_type_predictions: Predictions | None
     """Predictions of returns by closed-form fits of all score types. Present if the score type must be determined."""
@@ -143,7 +143,7 @@ def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
         is_log_odds=jnp.asarray(False),
         predictions=empty_predictions(1, spec.window),
         closed_form=closed_form.init(basis, spec.score_types) if spec.has_closed_form else None,
-        levels=empty_level_means(basis.n_levels) if basis.n_levels and method.uses_gradient else None,
+        levels=empty_level_statistics(basis.n_levels) if basis.n_levels and method.uses_gradient else None,
         score_type_predictions=empty_predictions(n_types, spec.window) if n_types > 1 else None,
     )
 
@@ -207,7 +207,7 @@ def observe_returns(
     Episodes where `ended` is false are ignored. `level` is None if levels make no difference.
     """
     if state.levels is not None and level is not None:
-        state = state._replace(levels=add_returns(state.levels, level, mean_reward, ended))
+        state = state._replace(levels=add_mean_rewards(state.levels, level, mean_reward, ended))
     return state._replace(
         scale=normalise.update_scale(state.scale, mean_reward, ended),
         return_scale=normalise.update_scale(state.return_scale, mean_reward * length, ended),

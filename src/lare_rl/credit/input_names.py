@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lare_rl.errors import LareError
-from lare_rl.tasks.spec import ScoredObservation, entry_meanings, select_states
+from lare_rl.tasks.spec import ScoredObservation, entry_meanings, select_sides
 
 __all__ = ["InputNames", "input_arrays", "input_sizes", "raw_feature_names"]
 
@@ -47,7 +47,7 @@ class InputNames:
     def resolve(self, scored_observation: ScoredObservation = "after", *, single_agent: bool = True) -> tuple[str, ...]:
         """Return the names of the inputs, with `scored_observation` replaced by the observations that a task names."""
         names = self.names if single_agent or self.names_of_many_agents is None else self.names_of_many_agents
-        scored = select_states(scored_observation, "observation", "next_observation")
+        scored = select_sides(scored_observation, "observation", "next_observation")
         resolved = (name for group in names for name in (scored if group == "scored_observation" else [group]))
         return tuple(dict.fromkeys(resolved))  # a name twice is the same input
 

@@ -1,4 +1,4 @@
-"""Means of returns by level, for decoders that are fitted by gradient descent.
+"""Means of R/T by level, for decoders that are fitted by gradient descent.
 
 Episodes may belong to levels, which differ in difficulty. A decoder is then fitted to R/T less the offset of the episode's level,
 
@@ -16,10 +16,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.nn.normalise import merge_means
 
-__all__ = ["LevelMeans", "add_returns", "empty_level_means", "level_offsets"]
+__all__ = ["LevelStatistics", "add_mean_rewards", "empty_level_statistics", "level_offsets"]
 
 
-class LevelMeans(NamedTuple):
+class LevelStatistics(NamedTuple):
     """The number, the mean and the sum of squared deviations of R/T in each level."""
 
     n_episodes: Float[Array, " levels"]
@@ -27,16 +27,19 @@ class LevelMeans(NamedTuple):
     sum_squares: Float[Array, " levels"]
 
 
-def empty_level_means(n_levels: int) -> LevelMeans:
+def empty_level_statistics(n_levels: int) -> LevelStatistics:
     """Return the state before the first episode."""
-    return LevelMeans(*(jnp.zeros(n_levels) for _ in LevelMeans._fields))
+    return LevelStatistics(*(jnp.zeros(n_levels) for _ in LevelStatistics._fields))
 
 
-def add_returns(
-    means: LevelMeans, level: Int[Array, " batch"], mean_reward: Float[Array, " batch"], mask: Bool[Array, " batch"]
-) -> LevelMeans:
+def add_mean_rewards(
+    statistics: LevelStatistics,
+    level: Int[Array, " batch"],
+    mean_reward: Float[Array, " batch"],
+    mask: Bool[Array, " batch"],
+) -> LevelStatistics:
     """Add the episodes where `mask` is true."""
-    n_levels = len(means.mean)
+    n_levels = len(statistics.mean)
     slot = jnp.where(mask, level, n_levels)  # an index out of range, which is dropped
 
     def sums(values: Float[Array, " batch"]) -> Float[Array, " levels"]:
@@ -45,17 +48,19 @@ def add_returns(
     n_new = sums(jnp.ones_like(mean_reward))
     mean = sums(mean_reward) / jnp.maximum(n_new, 1)
     squares = sums((mean_reward - mean[jnp.minimum(slot, n_levels - 1)]) ** 2)
-    n_episodes, merged, between = merge_means(means.n_episodes, means.mean, n_new, mean)
-    return LevelMeans(n_episodes, merged, means.sum_squares + squares + between)
+    n_episodes, merged, between = merge_means(statistics.n_episodes, statistics.mean, n_new, mean)
+    return LevelStatistics(n_episodes, merged, statistics.sum_squares + squares + between)
 
 
-def level_offsets(means: LevelMeans) -> Float[Array, " levels"]:
-    """Return d_g of each level; 0 for a level without episodes, and while there are fewer than two levels."""
-    n, total = means.n_episodes, jnp.sum(means.n_episodes)
-    n_levels = jnp.sum(n > 0)
-    mean = jnp.sum(n * means.mean) / jnp.maximum(total, 1)
-    within = jnp.sum(means.sum_squares) / jnp.maximum(total - n_levels, 1)
+def level_offsets(statistics: LevelStatistics) -> Float[Array, " levels"]:
+    """Return d_g of each level: 0 for a level without episodes, and for all while there is one level or none has two episodes."""
+    n, total = statistics.n_episodes, jnp.sum(statistics.n_episodes)
+    n_observed = jnp.sum(n > 0)
+    mean = jnp.sum(n * statistics.mean) / jnp.maximum(total, 1)
+    within = jnp.sum(statistics.sum_squares) / jnp.maximum(total - n_observed, 1)
+    # k - 1 times the mean number of episodes of k levels, in the method of moments for levels of different size.
     size = jnp.maximum(total - jnp.sum(n**2) / jnp.maximum(total, 1), 1e-6)
-    between = jnp.maximum(jnp.sum(n * (means.mean - mean) ** 2) - (n_levels - 1) * within, 0) / size
+    between = jnp.maximum(jnp.sum(n * (statistics.mean - mean) ** 2) - (n_observed - 1) * within, 0) / size
     shrinkage = between / jnp.maximum(between + within / jnp.maximum(n, 1), 1e-30)
-    return jnp.where((n > 0) & (n_levels > 1), shrinkage * (means.mean - mean), 0)
+    is_known = (n > 0) & (n_observed > 1) & (total > n_observed)
+    return jnp.where(is_known, shrinkage * (statistics.mean - mean), 0)

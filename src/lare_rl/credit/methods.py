@@ -119,6 +119,11 @@ class Method:
         return self.reward not in (Reward.TRUE, Reward.EPISODIC)
 
     @property
+    def has_separate_fit(self) -> bool:
+        """Whether its fit is too expensive for every update of the algorithm."""
+        return self.fit is not None and self.fit.separate
+
+    @property
     def calibrated(self) -> bool:
         """Whether its rewards are in the unit of the true ones, because they are fitted to add up to returns."""
         return self.reward is Reward.PROXY

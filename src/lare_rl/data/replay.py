@@ -104,7 +104,7 @@ class Replay(NamedTuple):
 
 
 class Index(NamedTuple):
-    """Transitions, each by its environment and its number there."""
+    """Transitions, each by its environment and its number there; in `sampling.py` also episodes, counted from the oldest that is stored."""
 
     env: Int[Array, "*batch"]
     number: Int[Array, "*batch"]

@@ -24,6 +24,7 @@ __all__ = [
     "count_episodes_since",
     "episodes_in_order",
     "get_episodes",
+    "n_packed_episodes",
     "sample_distinct_episodes",
     "sample_episode_steps",
     "sample_episodes",
@@ -53,7 +54,7 @@ class CreditSample(NamedTuple):
     steps: Index
     """[*updates rows]."""
     episode: Int[Array, "*updates rows"]
-    """The index of each row's episode; for padding, the number of episodes."""
+    """Which of `episodes` each row belongs to. Padding has the number of episodes, an index out of range."""
     episodes: EpisodeSample
 
 
@@ -72,7 +73,7 @@ def sample_distinct_episodes(replay: Replay, key: PRNGKeyArray, count: int) -> E
     """Sample finished episodes uniformly, without replacement. If there are fewer than `count`, the mask of the missing ones is 0."""
     available, slots = n_stored_episodes(replay), replay.first.shape[-1]
     has_episode = jnp.arange(slots) < available[:, None]
-    # The first episodes of a random order of all slots.
+    # Each stored episode has a random number, and those with the smallest are taken.
     order = jnp.where(has_episode, jax.random.uniform(key, has_episode.shape), jnp.inf).ravel()
     _, slot = jax.lax.top_k(-order, min(count, order.size))
     slot = jnp.pad(slot, (0, count - len(slot)))
@@ -95,11 +96,13 @@ def get_episodes(replay: Replay, index: Index) -> EpisodeSample:
     )
 
 
-def sample_episode_steps(replay: Replay, key: PRNGKeyArray, updates: int, count: int, steps: int) -> CreditSample:
-    """Sample `steps` steps of each of `count` episodes, for RRD."""
+def sample_episode_steps(
+    replay: Replay, key: PRNGKeyArray, updates: int, count: int, steps_per_episode: int
+) -> CreditSample:
+    """Sample some steps of each of `count` episodes, for RRD."""
     episodes_key, steps_key = jax.random.split(key)
     episodes = sample_episodes(replay, episodes_key, (updates, count))
-    layout = lay_out_sampled(episodes.length, sample_steps(steps_key, episodes.length, steps))
+    layout = lay_out_sampled(episodes.length, sample_steps(steps_key, episodes.length, steps_per_episode))
     return _credit_sample(episodes, layout)
 
 
@@ -110,19 +113,26 @@ def sample_padded(replay: Replay, key: PRNGKeyArray, updates: int, count: int, l
 
 
 def sample_packed(replay: Replay, key: PRNGKeyArray, updates: int, steps: int, rows: int) -> CreditSample:
-    """Sample max(1, steps / mean length) whole episodes, and put them one after the other into the rows, for RD."""
+    """Sample as many whole episodes as have about `steps` steps, and put them one after the other into the rows, for RD."""
 
     def sample_update(key: PRNGKeyArray) -> CreditSample:
         episodes = sample_episodes(replay, key, (steps,))
-        count = steps * jnp.sum(n_stored_episodes(replay)) // jnp.maximum(_n_finished_steps(replay), 1)
-        mask = episodes.mask * (jnp.arange(steps) < jnp.maximum(count, 1))
+        mask = episodes.mask * (jnp.arange(steps) < n_packed_episodes(replay, steps))
         return _pack(episodes._replace(mask=mask), rows)
 
     return jax.vmap(sample_update)(jax.random.split(key, updates))
 
 
+def n_packed_episodes(replay: Replay, steps: int) -> Int[Scalar, ""]:
+    """Return max(1, steps / mean length). The length is that from payment to payment, also if one is for fewer steps."""
+    n_episodes, n_steps = jnp.sum(n_stored_episodes(replay)), jnp.maximum(_n_finished_steps(replay), 1)
+    # In floating point, because the product may exceed 32 bits. A whole quotient must not be rounded down.
+    count = jnp.floor(steps * (n_episodes / n_steps) * (1 + 1e-6))
+    return jnp.maximum(count, 1).astype(jnp.int32)
+
+
 def count_episodes_since(replay: Replay, since: Int[Array, " envs"]) -> Int[Array, " envs"]:
-    """Return how many finished episodes of each environment have this number or a later one, and are still stored."""
+    """Return for each environment how many finished, stored episodes have the number `since` or a later one."""
     return jnp.maximum(replay.current_episode - jnp.maximum(since, replay.oldest), 0)
 
 
@@ -134,20 +144,22 @@ def episodes_in_order(
     Return at most `count` episodes, and only episodes that fit into the rows as a whole.
     """
     counts = count_episodes_since(replay, since)
-    ends = jnp.cumsum(counts)
     position = start + jnp.arange(count)
-    env = jnp.minimum(jnp.searchsorted(ends, position, side="right"), len(counts) - 1)
-    number = jnp.maximum(since, replay.oldest)[env] + position - (ends - counts)[env]
-    episodes = get_episodes(replay, Index(env, number - replay.oldest[env]))
-    return _pack(episodes._replace(mask=episodes.mask * (position < ends[-1])), rows)
+    env, number = _locate(counts, position)
+    episodes = get_episodes(replay, Index(env, number + jnp.maximum(since - replay.oldest, 0)[env]))
+    return _pack(episodes._replace(mask=episodes.mask * (position < jnp.sum(counts))), rows)
 
 
 def _sample_items(counts: Int[Array, " envs"], key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
     """Sample uniformly from the items of all environments. `number` counts from 0 in each environment."""
+    return _locate(counts, jax.random.randint(key, shape, 0, jnp.maximum(jnp.sum(counts), 1)))
+
+
+def _locate(counts: Int[Array, " envs"], position: Int[Array, "*batch"]) -> Index:
+    """Return the items at these positions of a row of all items, one environment after the other."""
     ends = jnp.cumsum(counts)
-    number = jax.random.randint(key, shape, 0, jnp.maximum(ends[-1], 1))
-    env = jnp.minimum(jnp.searchsorted(ends, number, side="right"), len(counts) - 1)
-    return Index(env, number - (ends - counts)[env])
+    env = jnp.minimum(jnp.searchsorted(ends, position, side="right"), len(counts) - 1)
+    return Index(env, position - (ends - counts)[env])
 
 
 def _credit_sample(episodes: EpisodeSample, layout: Layout) -> CreditSample:

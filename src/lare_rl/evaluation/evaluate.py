@@ -87,7 +87,9 @@ def move_evaluations(run: Run, environment: str | None) -> Run:
     task = run.config.task
     if load_env_spec(task).is_jax:
         raise LareError(f"{task.name}: only environments on the host can be evaluated in another environment")
-    task = TaskSpec.model_validate(task.model_dump() | {"evaluation_environment": environment})
+    moved = {"evaluation_environment": environment}
+    teams = [team.model_dump() | moved for team in task.teams]
+    task = TaskSpec.model_validate(task.model_dump() | moved | {"teams": teams})
     trust_environment(task)
     return replace(run, config=run.config.model_copy(update={"task": task}))
 

@@ -1,11 +1,11 @@
 """`lare-rl export`: what a run has learned, for programs that have neither LaRe nor JAX.
 
 DIRECTORY/
-  export.json              task, method, algorithm, seed, the policy's step; inputs, outputs and operations of each function
-  policy.npz, .onnx        observation -> action
-  reward.npz, .onnx        steps -> r_hat, phi and decoder as one function; one reward_TEAM each if several teams learn
-  latent_function.py       the source of phi, for readers
-  exported.py, evaluate.py NumPy code that evaluates the functions in export.json and the .npz files
+  export.json                task, method, algorithm, seed, the policy's step; inputs, outputs and operations of each function
+  policy.npz, .onnx          observation -> action
+  reward.npz, .onnx          steps -> r_hat, phi and decoder as one function; one reward_TEAM each if several teams learn
+  latent_function.py, .json  the source of phi, and how it was made; one latent_function_TEAM each if several teams learn
+  exported.py, evaluate.py   NumPy code that evaluates the functions in export.json and the .npz files
 """
 
 import json
@@ -72,13 +72,13 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
             phi = run.functions[team_index] if run.functions else None
             graph = reward_graph(decoders[team_index], config, team_index, phi)
             graphs["reward" if role is task else f"reward_{role.team}"] = graph
-    functions = {name: _describe_graph(graph) for name, graph in graphs.items()}
+    descriptions = {name: _describe_graph(graph) for name, graph in graphs.items()}
     if config.env.discrete and not config.team_level:  # for `exported.reward`, which makes one-hot rows of choices
         choices = {"first": config.env.first_choice, "count": config.env.action_size}
-        functions |= {name: {**functions[name], "choices": choices} for name in graphs if name != "policy"}
+        descriptions |= {name: {**descriptions[name], "choices": choices} for name in graphs if name != "policy"}
     origin = {"method": settings.method, "algorithm": settings.algorithm, "seed": run.seeds[seed_index], "step": step}
     with new_directory(out) as new:
-        _write_files(new, graphs, {"lare": code_version(), "task": task.name, **origin, **functions})
+        _write_files(new, graphs, {"lare": code_version(), "task": task.name, **origin, **descriptions})
         if no_reward_reason is None:
             for role, function in zip(task.roles, run.functions, strict=False):  # a method without phi has no functions
                 function.save(new / function_filename(task, role))
@@ -116,7 +116,7 @@ def _describe_graph(graph: Graph) -> dict[str, Any]:
 def _option_json(option: Any) -> Any:
     """Return an option as JSON. Arrays are None, because they are in the .npz file."""
     if isinstance(option, Gather):
-        return option.slices and [[s.start, s.stop, s.step] for s in option.slices]
+        return None if option.slices is None else [[s.start, s.stop, s.step] for s in option.slices]
     return None if isinstance(option, np.ndarray) else option
 
 

@@ -29,7 +29,7 @@ from lare_rl.phi.builder import Builder, building
 from lare_rl.phi.graph import Graph
 from lare_rl.phi.limits import UNLIMITED
 from lare_rl.phi.read import apply_program
-from lare_rl.tasks.spec import select_states
+from lare_rl.tasks.spec import select_sides
 
 __all__ = ["missing_reward_reason", "reward_graph"]
 
@@ -119,7 +119,7 @@ class _StepInputs(dict[str, Any]):
         """Return the factors of a step, for each agent by itself."""
         assert self.phi is not None
         rows, factors = self.rows or (1,), []
-        for side in select_states(self.config.scored_observation, "before", "after"):
+        for side in select_sides(self.config.scored_observation, "before", "after"):
             inputs = (self[name].reshaped((*rows, -1), 0) for name in (side, "env_action"))
             scores = apply_program(self.phi.source, *inputs)
             factors.append(scores.reshaped((*self.rows, -1), None))

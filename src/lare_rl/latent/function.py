@@ -21,7 +21,7 @@ from lare_rl.llm.prompts import FunctionKind
 from lare_rl.phi.graph import Graph
 from lare_rl.phi.names import factor_meanings, factor_names
 from lare_rl.phi.read import read
-from lare_rl.tasks.spec import ScoredObservation, TaskSpec, require_role, select_states, step_names
+from lare_rl.tasks.spec import ScoredObservation, TaskSpec, names_by_side, require_role, select_sides
 from lare_rl.util.files import write_bytes
 from lare_rl.util.rows import as_numbers, as_rows
 
@@ -130,7 +130,7 @@ class LatentFunction:
         """
         if scored_observation not in ("before", "after", "both"):
             raise LareError(f"scored_observation = {short_repr(scored_observation)}: it is before, after or both")
-        states = select_states(scored_observation, observation, next_observation)
+        states = select_sides(scored_observation, observation, next_observation)
         arrays = [as_numbers("observation", state) for state in states] + [as_numbers("action", action)]
         batch_shape = arrays[-1].shape[:-1]
         if any(not array.ndim or array.shape[:-1] != batch_shape for array in arrays):
@@ -146,7 +146,7 @@ class LatentFunction:
 
     def factor_columns(self, scored_observation: ScoredObservation) -> list[str]:
         """Return the names of the factors of `step_factors`."""
-        return step_names(scored_observation, self.names)
+        return names_by_side(scored_observation, self.names)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for another process, without the graph, which is read again there."""

@@ -23,7 +23,7 @@ from lare_rl.phi.graph import Graph
 from lare_rl.phi.limits import MAX_FACTORS, RefusedError
 from lare_rl.phi.names import factor_names
 from lare_rl.phi.read import read
-from lare_rl.tasks.spec import TaskSpec, require_role, select_states
+from lare_rl.tasks.spec import TaskSpec, require_role, select_sides
 from lare_rl.util.rows import as_numbers
 from lare_rl.util.statistics import FLOAT32_NOISE
 
@@ -191,14 +191,14 @@ def _random_steps(task_json: str, n_steps: int, seed: int) -> Steps:
     role = TaskSpec.model_validate_json(task_json)
     with contextlib.closing(make_host_env(role)) as env:
         team, rng = env.spec.find_team(role.team), np.random.default_rng(seed)
-        rows_by_side: list[list[list[np.ndarray]]] = [[] for _ in select_states(role.scored_observation, 0, 1)]
+        rows_by_side: list[list[list[np.ndarray]]] = [[] for _ in select_sides(role.scored_observation, 0, 1)]
         n_rows, n_played, episode_seeds = 0, 0, itertools.count(seed)
         # Episodes are played to their ends, because a function is tried on their last steps too.
         while n_rows < n_steps and n_played < _MAX_PLAYED_STEPS:
             steps = play_steps(env, None, rng, next(episode_seeds))
             for timestep, env_action, next_timestep in itertools.islice(steps, _MAX_PLAYED_STEPS - n_played):
                 acting = slice(None) if role.credit_scope == "state" else timestep.alive[team.agents]
-                sides = select_states(role.scored_observation, timestep, next_timestep)
+                sides = select_sides(role.scored_observation, timestep, next_timestep)
                 for rows, side in zip(rows_by_side, sides, strict=True):
                     inputs = phi_inputs(role.credit_scope, team, side, env_action)
                     rows.append([array[acting] for array in inputs])

@@ -11,7 +11,7 @@ from lare_rl.envs.play import Episode
 from lare_rl.errors import check_count
 from lare_rl.latent.verify import N_SAMPLE_STEPS, Steps, evenly_spaced
 from lare_rl.logs.open_log import open_log
-from lare_rl.tasks.spec import TaskSpec, select_states
+from lare_rl.tasks.spec import TaskSpec, select_sides
 
 __all__ = ["logged_episodes", "logged_steps"]
 
@@ -40,7 +40,7 @@ def logged_steps(source: Any, task: TaskSpec | str | Path, count: int = N_SAMPLE
         selected = evenly_spaced(len(episode), count)  # a long episode need not stay in memory
         steps.append((episode.observation[selected], episode.next_observation[selected], episode.action[selected]))
     before, after, action = map(np.concatenate, zip(*steps, strict=True))
-    sides = select_states(task.scored_observation, before, after)
+    sides = select_sides(task.scored_observation, before, after)
     rows = evenly_spaced(len(sides) * len(action), count)
     return np.concatenate(sides)[rows], np.concatenate([action] * len(sides))[rows]
 

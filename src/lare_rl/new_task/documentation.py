@@ -1,11 +1,11 @@
 """Texts of a task from the documentation of its environment, without the sentences about rewards."""
 
 import inspect
-import itertools
 import re
 from collections.abc import Mapping, Sequence
 
 __all__ = [
+    "TITLES",
     "first_section",
     "plain_lines",
     "remove_rewards",
@@ -21,6 +21,7 @@ REWARD_WORDS = re.compile(
     r"reward|penal|\bcosts?\b|\bscor(e|es|ed|ing)\b|\bgraded\b"
     r"|\b(a|the|final) (mark|grade) (is|of|from|for|between|at the end|out of|\(?-?\d)"
     r"|(\d|\b(earn|gain|get|give|lose|receive|win|award)\w*)( \w+)? points?\b"
+    r"|\bbonus(es)?\b|\bpayoffs?\b|\bprofits?\b|\bfitness\b"
     r"|\b(average|cumulative|discounted|episodic?|expected|mean|the|total) returns?\b(?! to\b)",
     re.IGNORECASE,
 )
@@ -31,8 +32,8 @@ MIN_WORDS = 8
 
 SENTENCE_END = re.compile(r"(?<=[^\d][.!?])\s+(?=[A-Z`*])")
 
-FIGURE = re.compile(r"^```\{.*?^```|<[^<>\n]+>", re.MULTILINE | re.DOTALL)
-"""A directive of Sphinx in a code block, or a tag of HTML."""
+MARKUP = re.compile(r"^```(?:\{|python).*?^```|</?[A-Za-z!][^<>\n]*>", re.MULTILINE | re.DOTALL)
+"""A block with Python code or a directive of Sphinx, or a tag of HTML."""
 NOISE = re.compile(r"^!\[|^:?-{3,}|^```|^\s*$")
 """The start of a line without text: an image, a rule, a code fence, or an empty line."""
 NUMBERED = re.compile(r"\d+(\s*(-|to)\s*\d+)?[.:]\s")
@@ -45,33 +46,39 @@ TITLES = {
     "action": ("action space", "action", "actions"),
 }
 """Titles of the section from which a text is taken: the first of them that the documentation has."""
-EPISODE_END_TITLES = ("episode end", "episode termination")
+EPISODE_END_TITLES = ("episode end", "episode termination", "termination")
+"""The same for the end of an episode, which the description mentions last."""
 
 
 def split_sections(documentation: str) -> dict[str, str]:
     """Return the sections of a Markdown text by their headings in lower case. The key "" is the text before the first heading."""
-    text = FIGURE.sub("", inspect.cleandoc(documentation))
+    text = MARKUP.sub("", inspect.cleandoc(documentation))
     first, *rest = HEADING.split(text)
     sections = {"": first}
     for title, body in zip(rest[::2], rest[1::2], strict=True):
-        sections.setdefault(title.lower(), body)
+        sections[title.lower()] = sections.get(title.lower(), "") + body
     return sections
 
 
-def first_section(sections: Mapping[str, str], key: str) -> list[str]:
-    """Return the lines of the first section about a text that is not empty."""
-    return plain_lines(next((sections[title] for title in TITLES[key] if sections.get(title, "").strip()), ""))
+def first_section(sections: Mapping[str, str], titles: Sequence[str]) -> list[str]:
+    """Return the lines of the first section that has one of the titles and is not empty."""
+    title = _first_title(sections, titles)
+    return [] if title is None else plain_lines(sections[title])
+
+
+def _first_title(sections: Mapping[str, str], titles: Sequence[str]) -> str | None:
+    return next((title for title in titles if sections.get(title, "").strip()), None)
 
 
 def single_agent_lines(sections: Mapping[str, str]) -> dict[str, list[str]]:
     """Return the lines of each text of a task of one agent, by its key. The description begins with the text before all headings."""
-    lines = {key: first_section(sections, key) for key in TITLES}
+    lines = {key: first_section(sections, titles) for key, titles in TITLES.items()}
     return lines | {"description": plain_lines(sections[""]) + lines["description"]}
 
 
 def unused_titles(sections: Mapping[str, str]) -> tuple[str, ...]:
     """Return the titles of the sections that `single_agent_lines` and `write_texts` do not read."""
-    used = {"", *itertools.chain(*TITLES.values()), *EPISODE_END_TITLES}
+    used = {"", *(_first_title(sections, titles) for titles in (*TITLES.values(), EPISODE_END_TITLES))}
     return tuple(title for title, body in sections.items() if title not in used and body.strip())
 
 
@@ -84,10 +91,10 @@ def write_texts(
     """
     cleaned = {key: remove_rewards(text) for key, text in lines.items()}
     texts = {key: text for key, (text, _) in cleaned.items()}
-    endings = (remove_rewards(plain_lines(sections.get(title, "")))[0] for title in EPISODE_END_TITLES)
-    if texts["description"] and (ending := next(filter(None, endings), "")):
+    ending, ending_removed = remove_rewards(first_section(sections, EPISODE_END_TITLES))
+    if texts["description"] and ending:
         texts["description"] += f"\n{ending}"
-    return texts, tuple(line for _, removed in cleaned.values() for line in removed)
+    return texts, (*(line for _, removed in cleaned.values() for line in removed), *ending_removed)
 
 
 def plain_lines(text: str) -> list[str]:

@@ -15,7 +15,7 @@ from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.envs.pettingzoo_construct import agent_kind, find_time_limit, make_parallel_env
 from lare_rl.envs.pettingzoo_env import ParallelHost
 from lare_rl.new_task import draft
-from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
+from lare_rl.new_task.documentation import TITLES, first_section, plain_lines, split_sections, write_texts
 from lare_rl.new_task.draft import Draft, count_entries, file_name
 from lare_rl.tasks.spec import TaskSpec, split_environment
 
@@ -123,7 +123,7 @@ def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
     lines = {"description": [line for line in about if not IRRELEVANT.search(line)]}
     for key in TEAM_KEYS:
         mentions = [line for line in about if re.search(rf"\b{key}s?( space)?: ", line)]
-        lines[key] = first_section(sections, key) or mentions
+        lines[key] = first_section(sections, TITLES[key]) or mentions
     return write_texts(lines, sections)
 
 

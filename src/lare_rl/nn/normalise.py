@@ -18,7 +18,7 @@ __all__ = [
     "root_mean_square",
     "running_std",
     "standardise",
-    "standardise_if_observed",
+    "standardise_unless_empty",
     "update_mean_std",
     "update_scale",
 ]
@@ -28,7 +28,7 @@ CLIP = 10.0
 
 
 class RunningMeanStd(NamedTuple):
-    """Mean and standard deviation of each feature over all rows so far."""
+    """Statistics of all rows so far, from which the mean and the standard deviation of each feature follow."""
 
     n_rows: Float[Array, ""]
     mean: Float[Array, "*features"]
@@ -53,10 +53,11 @@ def update_mean_std(
 
 
 def merge_means(n: Any, mean: Any, n_new: Any, new_mean: Any, square: Any = lambda d: d**2) -> tuple[Any, Any, Any]:
-    """Return the number and the mean of old and new cases together, and d^2 n n_new / (n + n_new), with d the difference of the means.
+    """Merge the mean of `n` old rows and that of `n_new` new rows.
 
-    The squared deviations from the merged mean are the sum of the last, and of those within the old and within the new cases. This is the
-    parallel update of Chan, Golub and LeVeque (1983), which avoids catastrophic cancellation.
+    Return the number of all rows, their mean, and d^2 n n_new / (n + n_new), where d is the difference of the two means. Added to the sums
+    of squared deviations of the old and of the new rows, the last value gives that of all rows. `square` computes d^2; for products of
+    features it is the outer product. The parallel update of Chan, Golub and LeVeque (1983), which avoids catastrophic cancellation.
     """
     n_all, difference = n + n_new, new_mean - mean
     fraction = n_new / jnp.maximum(n_all, 1)
@@ -64,7 +65,7 @@ def merge_means(n: Any, mean: Any, n_new: Any, new_mean: Any, square: Any = lamb
 
 
 def running_std(statistics: RunningMeanStd) -> Float[Array, "*features"]:
-    """Return the standard deviations. That of a feature that has never varied is 0."""
+    """Return the standard deviation of each feature: 0 for a feature that has never varied."""
     std = jnp.sqrt(statistics.sum_squares / jnp.maximum(statistics.n_rows, 1))
     return jnp.where(std > FLOAT32_NOISE * jnp.abs(statistics.mean), std, 0)
 
@@ -76,7 +77,7 @@ def standardise(statistics: RunningMeanStd, rows: Float[Array, "*batch features"
     return jnp.where(std > 0, jnp.clip(scaled, -CLIP, CLIP), 0)
 
 
-def standardise_if_observed(
+def standardise_unless_empty(
     statistics: RunningMeanStd, rows: Float[Array, "*batch features"]
 ) -> Float[Array, "*batch features"]:
     """Return standardised rows, or the rows unchanged while the statistics are empty."""

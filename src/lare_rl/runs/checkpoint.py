@@ -1,4 +1,4 @@
-"""Checkpoints that stay valid if the process is killed at any moment. Each row of the replay is written once.
+"""Checkpoints that stay valid if the process is killed at any moment. Only new rows of the replay are written.
 
     checkpoint/
       rows-0.npz, rows-1.npz, ...   the replay's rows, from old to new
@@ -29,17 +29,19 @@ __all__ = ["STATE_FILE", "fill_template", "load", "named_leaves", "read_metadata
 
 STATE_FILE = "state.npz"
 METADATA, ROW_FILES = "host", "segments"
-"""The names in `state.npz` of the metadata and of the list of row files, both in JSON. The names of a state's arrays begin with a dot."""
+"""The names in `state.npz` of the metadata and of the list of row files, both in JSON. The names of a state's arrays begin with a dot.
+Files of all versions have these two names."""
 REPLAY = ".replay."
 """The path of the replay within the state."""
 SAVED_BY_ROW = f"{REPLAY}columns"
 """The path of the arrays that are saved by row."""
-NEW_STATE = (
+ZERO_IF_MISSING = (
     *(".closed_form.strengths.", ".closed_form.intercept", ".closed_form.start_value"),
-    *(".is_log_odds", ".predictions.level", ".score_type_predictions.level"),
-    *(".statistics.", ".return_scale.", ".is_average", ".predictions."),  # of a method that fits nothing
+    *(".is_log_odds", ".is_average", ".predictions.level", ".score_type_predictions.level"),
 )
 """Paths of arrays that earlier checkpoints do not have. Zeros mean that they have not been computed yet, or make no difference."""
+ZERO_IF_GROUP_IS_MISSING = ".statistics.", ".return_scale.", ".predictions."
+"""Paths of groups of arrays that earlier checkpoints do not have if the method fits nothing."""
 
 State = TypeVar("State")
 """A training state with a replay: `replay.columns` are arrays of [seeds envs rows ...], which are saved by row.
@@ -78,26 +80,28 @@ class Snapshot(NamedTuple):
 def take_snapshot(
     directory: Path, learner: Any, metadata: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
 ) -> Snapshot:
-    """Copy what the next checkpoint saves from the device. The last checkpoint must have been written.
+    """Copy from the device what the next checkpoint saves. Call this only after the last checkpoint has been written.
 
     Args:
         metadata: other data to save, as JSON.
         arrays: other data to save, as arrays. Their names must not begin with a dot, or be `METADATA` or `ROW_FILES`.
     """
-    capacity, end = _capacity(learner), np.asarray(learner.replay.next_row)
-    start, row_files = np.zeros_like(end), []
+    capacity, newest_row = _capacity(learner), np.asarray(learner.replay.next_row)
+    start, row_files = np.zeros_like(newest_row), []
     if (directory / STATE_FILE).exists():
         with open_npz(directory / STATE_FILE) as saved:
-            start, row_files = saved[".replay.next_row"], _parse_row_files(saved[ROW_FILES])
-    # The last saved row is saved again, because it held only the newest observation then. If an episode has just been
-    # dropped, `end` is smaller than before. Of more new rows than the capacity, only the last exist.
-    start = np.minimum(np.maximum(start, end - capacity + 1), end)
-    count = end - start + 1
+            start, row_files = saved[f"{REPLAY}next_row"], _parse_row_files(saved[ROW_FILES])
+    # The last saved row is saved again: it held only an observation, and may hold a whole step now. If an episode has just been
+    # dropped, `newest_row` is smaller than before. If there are more new rows than the capacity, only the last of them are stored.
+    start = np.minimum(np.maximum(start, newest_row - capacity + 1), newest_row)
+    count = newest_row - start + 1
     width = padded_size(int(count.max()))
     rows = _gather_rows(learner.replay.columns, (start[..., None] + np.arange(width)) % capacity)
     newest = _RowFile(row_files[-1].number + 1 if row_files else 0, start.tolist(), count.tolist())
     row_files.append(newest)
-    in_use = [row_file for row_file in row_files if np.any(np.add(row_file.start, row_file.count) > end - capacity)]
+    in_use = [
+        row_file for row_file in row_files if np.any(np.add(row_file.start, row_file.count) > newest_row - capacity)
+    ]
     state = {name: np.array(leaf) for name, leaf in named_leaves(learner).items()}
     state |= {name: np.array(array) for name, array in arrays.items()}
     state[METADATA] = np.array(json.dumps(metadata))
@@ -106,7 +110,7 @@ def take_snapshot(
         row_file=newest.filename,
         rows={name: np.array(values[:, :, : count.max()]) for name, values in jax.device_get(rows).items()},
         state=state,
-        # These are not always the newest files: a file from before a dropped episode may reach further.
+        # A file from before a dropped episode may hold higher row numbers than later files, and stay in use longer.
         used_files={row_file.filename for row_file in in_use},
     )
 
@@ -160,7 +164,7 @@ def named_leaves(state: Any) -> dict[str, Any]:
 def fill_template(template: State, arrays: Mapping[str, np.ndarray]) -> State:
     """Replace the leaves of a template by saved arrays, whose names may be of an earlier version.
 
-    A leaf that is a NumPy array, which may have 64 bits, stays a NumPy array.
+    A NumPy leaf stays a NumPy array, because JAX would cut 64 bits to 32.
 
     Raises `ValueError` if an array is missing, or if a shape or a type differs.
     """
@@ -174,7 +178,11 @@ def fill_template(template: State, arrays: Mapping[str, np.ndarray]) -> State:
             continue
         array = arrays.get(name)
         if array is None:
-            if not any(path in name for path in NEW_STATE):
+            group = name.rpartition(".")[0] + "."
+            is_new = any(path in name for path in ZERO_IF_MISSING) or (
+                group.endswith(ZERO_IF_GROUP_IS_MISSING) and not any(other.startswith(group) for other in arrays)
+            )
+            if not is_new:
                 raise ValueError(f"{name} is missing")
             array = np.zeros(leaf.shape, leaf.dtype)
         if name.startswith(REPLAY):

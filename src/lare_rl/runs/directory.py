@@ -8,6 +8,7 @@ failed_batch.npz     the input of the latent function, if it failed
 """
 
 import contextlib
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -173,7 +174,12 @@ def default_directory(task: TaskSpec, settings: ResolvedSettings) -> Path:
 
 def function_filename(task: TaskSpec, role: TaskSpec) -> str:
     """Return the name of the file of a role's latent function."""
-    return "latent_function.py" if role is task else f"latent_function_{role.team}.py"
+    if role is task:
+        return "latent_function.py"
+    team = re.sub(r"[^\w.\-]", "-", str(role.team))
+    if team != role.team:  # several teams may have become the same
+        team += f"-{task.teams.index(role)}"
+    return f"latent_function_{team}.py"
 
 
 def function_paths(directory: Path, config: Config) -> list[tuple[TaskSpec, Path]]:

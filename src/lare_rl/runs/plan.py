@@ -43,7 +43,7 @@ class RunPlan:
         """The settings that the file has, in nested tables."""
         return self.settings.model_dump(exclude_unset=True)
 
-    def has(self, name: str, settings: Settings) -> bool:
+    def has_same_value(self, name: str, settings: Settings) -> bool:
         """Return whether a setting, by its dotted name, has the value that the file says."""
 
         def get(values: Any) -> Any:
@@ -111,13 +111,12 @@ def load_config(path: str | Path) -> RunPlan:
 
 def _plan_repetition(directory: Path) -> RunPlan:
     """Return the plan that repeats a run, with the settings that it used."""
-    from lare_rl.config.effective import unused_names
+    from lare_rl.config.effective import dump_by_algorithm, unused_names
     from lare_rl.runs.directory import open_run
 
     run = open_run(directory)
     resolved = run.config.settings
-    values = resolved.model_dump()
-    values[resolved.algorithm] = values.pop("hyperparameters")
+    values: dict[str, Any] = dump_by_algorithm(resolved)
     values |= {"draw": 0, "candidates": N_CANDIDATES}  # the functions themselves are used again
     for name in unused_names(resolved):
         table, _, key = name.rpartition(".")

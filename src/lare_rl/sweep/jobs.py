@@ -1,5 +1,6 @@
 """Jobs, which are planned runs: their directories, their progress, and their training."""
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +22,9 @@ from lare_rl.tasks.spec import TaskSpec
 from lare_rl.tasks.trust import trust_environment
 from lare_rl.training.latent_functions import choose_functions
 
-__all__ = ["Job", "check_job", "job_to_json", "make_job", "train_job"]
+__all__ = ["Job", "check_job", "describe_job", "make_job", "train_job"]
 
-ANOTHER_OUT = "choose another output directory (--out)"
+ANOTHER_OUT = "choose another directory for the runs (in a sweep's file: out; for lare-rl reproduce: --runs)"
 
 
 @dataclass(frozen=True)
@@ -105,17 +106,19 @@ def check_job(job: Job) -> None:
     config = read_config(job.directory)
     if config.task.digest != job.task.digest:
         raise LareError(f"{job.directory} holds a run of another task: {ANOTHER_OUT}")
-    old = effective_settings(config.settings)
-    for name, value in effective_settings(job.resolved).items():
-        if (old_value := old.get(name)) != value:
-            extend = f"extend it with lare-rl train --resume {job.directory} --steps {value}, or "
-            hint = f"{extend if name == 'steps' else ''}{ANOTHER_OUT}"
-            raise LareError(f"{job.directory} holds a run with {name} = {old_value}, not {value}: {hint}")
+    old, new = effective_settings(config.settings), effective_settings(job.resolved)
+    different_names = [name for name, value in new.items() if old.get(name) != value]
+    if different_names:
+        name = different_names[0]
+        command = f"lare-rl train --resume {shlex.quote(str(job.directory))} --steps {new['steps']}"
+        can_extend = different_names == ["steps"] and new["steps"] > old["steps"]
+        hint = f"extend it with {command}, or {ANOTHER_OUT}" if can_extend else ANOTHER_OUT
+        raise LareError(f"{job.directory} holds a run with {name} = {old.get(name)}, not {new[name]}: {hint}")
     if functions and config.function_sha256 != tuple(function.digest for function in functions):
         raise LareError(f"{job.directory} holds a run with another latent function: {ANOTHER_OUT}")
 
 
-def job_to_json(job: Job) -> dict[str, Any]:
+def describe_job(job: Job) -> dict[str, Any]:
     """Describe a job for `train_job` in another process."""
     return {
         "directory": str(job.directory.absolute()),
@@ -125,11 +128,13 @@ def job_to_json(job: Job) -> dict[str, Any]:
     }
 
 
-def train_job(job: dict[str, Any]) -> None:
-    """Train the run that `job_to_json` describes, or resume it."""
-    directory, task = Path(job["directory"]), TaskSpec(**job["task"])
+def train_job(description: dict[str, Any]) -> None:
+    """Train the run that `describe_job` describes, or resume it."""
+    directory, task = Path(description["directory"]), TaskSpec(**description["task"])
     if (directory / CONFIG).is_file():
         trust_environment(task)
         lare_rl.resume(directory)
     else:
-        lare_rl.train(task, Settings(**job["settings"]), function=job["functions"] or None, out=directory)
+        lare_rl.train(
+            task, Settings(**description["settings"]), function=description["functions"] or None, out=directory
+        )

@@ -21,7 +21,7 @@ from typing import Any
 
 from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.runs.directory import RunBusyError
-from lare_rl.sweep.jobs import Job, job_to_json, train_job
+from lare_rl.sweep.jobs import Job, describe_job, train_job
 from lare_rl.sweep.resources import PREALLOCATE, Resources, Slot, assign_slots, last_line
 from lare_rl.util.files import make_directory
 from lare_rl.util.processes import own_session
@@ -102,7 +102,7 @@ def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | N
     """Train a job in a new process, which writes its output to RUN.log. Return the error, or None."""
     make_directory(job.directory.parent)
     log = job.directory.with_name(job.directory.name + ".log")
-    request = json.dumps({"job": job_to_json(job), "cores": slot.cores})
+    request = json.dumps({"job": describe_job(job), "cores": slot.cores})
     with log.open("a", encoding="utf-8") as file:
         log_start = file.tell()
         # In its own session, so that Ctrl-C reaches it only once, through this process.
@@ -167,7 +167,7 @@ def train_on_ray(
         variables = {PREALLOCATE: "false"} if 0 < accelerators < 1 else {}
         options: dict[str, Any] = {"num_cpus": resources.cores, "num_gpus": accelerators, "max_calls": 1}
         remote = ray.remote(**options, runtime_env={"env_vars": variables})(_train_when_free)
-        pending = {remote.remote(job_to_json(job)): job for job in jobs}
+        pending = {remote.remote(describe_job(job)): job for job in jobs}
         while pending:
             (task,), _ = ray.wait(list(pending), num_returns=1)
             job = pending.pop(task)

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from lare_rl.config.effective import unused_settings
+from lare_rl.config.effective import describe_unused_settings
 from lare_rl.config.settings import Settings
 from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import load_task, resolve_path
@@ -147,7 +147,7 @@ def _make_jobs(sweep: Sweep, path: Path) -> Iterator[Job]:
 
 def _check_settings(jobs: Sequence[Job]) -> None:
     """Raise `LareError` if a setting affects none of the jobs."""
-    unused = [unused_settings(job.settings, job.resolved, job.task) for job in jobs]
+    unused = [describe_unused_settings(job.settings, job.resolved, job.task) for job in jobs]
     for name, message in unused[0].items():
         if all(name in messages for messages in unused):
             raise LareError(f"no run uses {name}; in the first, {message}")

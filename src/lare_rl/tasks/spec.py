@@ -22,18 +22,19 @@ __all__ = [
     "TaskSpec",
     "base_name",
     "entry_meanings",
+    "names_by_side",
     "require_role",
-    "select_states",
+    "select_sides",
     "split_environment",
-    "step_names",
     "unwritten_texts",
 ]
 
 ScoredObservation = Literal["before", "after", "both"]
-"""See `TaskSpec.scored_observation`. For both, `phi` is called on each observation, and the factors are concatenated. A decoder's
-input `scored_observation` is then both observations."""
+"""See `TaskSpec.scored_observation`. With `both`, `phi` is called on each observation, and the factors are concatenated. The input
+`scored_observation` of a decoder is then both observations."""
 
-State = TypeVar("State")
+Side = TypeVar("Side")
+"""What belongs to the time before an action, or after it: observations, time steps or texts."""
 
 CreditScope = Literal["observation", "state"]
 """See `TaskSpec.credit_scope`."""
@@ -48,9 +49,11 @@ SHARED_KEYS = (
     "max_episode_steps",
     "credit_scope",
     "scored_observation",
+    "score",
     "payments",
     "paid_for",
     "group",
+    "measures",
     "processes",
     "timeout",
 )
@@ -79,7 +82,7 @@ class TaskSpec(CheckedModel):
 
     model_config = ConfigDict(str_strip_whitespace=True)
 
-    name: Annotated[str, Field(min_length=1, pattern=r"^[\w.\-]+$")]
+    name: Annotated[str, Field(pattern=r"^\.*[\w\-][\w.\-]*$")]
     """Name in commands and of runs."""
     environment: Annotated[str, Field(min_length=1)]
     """A Gymnasium id (`module:id` first imports the module that registers it), another family's name, such as `particles/CN-6`,
@@ -88,9 +91,10 @@ class TaskSpec(CheckedModel):
     """The environment of evaluations, such as held-out maps, years or demand, with the same module and sizes. Only on the host.
     By default, `environment`."""
     observation_size: Count
-    """Number of entries of an observation."""
+    """Number of entries of an observation; with `credit_scope = "state"`, of the global state."""
     action_size: Count
-    """Number of entries of a continuous action, or of discrete actions."""
+    """Number of entries of a continuous action, or of discrete actions; with `credit_scope = "state"`, of all agents of the team
+    together."""
     scored_observation: ScoredObservation = "after"
     """Observations of a step that factors and raw features are computed from: before the action, after it, or both."""
     description: Annotated[str, Field(min_length=1)]
@@ -111,12 +115,13 @@ class TaskSpec(CheckedModel):
     """Steps that a payment is for: all since the last payment, or `{ steps = 20 }`, the last 20."""
     group: str | None = None
     """Key of `info` with the group of an episode, a whole number from 0 to 63: its level, map, weather or demand. Each group has
-    an intercept, so that an easy level does not credit its steps."""
+    an intercept, so that the steps of an easy level get no credit for its higher returns."""
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` whose values are averaged and reported beside the return."""
     processes: Literal["auto", "separate"] = "auto"
-    """`separate`: every environment has its own process, for a simulator that allows one in a process. `auto`: only if an
-    unknown package's environment starts or steps slowly, or if a second one in its process fails, hangs or changes the first."""
+    """`separate`: every environment has its own process, for a simulator that allows one in a process. `auto`: only an
+    environment of a package that LaRe does not know, if it starts or steps slowly, or if a second one in the same process fails,
+    hangs or changes the first."""
     timeout: Annotated[float, Field(gt=0)] = 120.0
     """Time (s) within which an environment in another process must reply; else the run stops with a message."""
     arguments: dict[str, Any] = Field(default_factory=dict)
@@ -152,6 +157,8 @@ class TaskSpec(CheckedModel):
                 raise ValueError(
                     f"{role.name} is not a team of {self.environment}. Its file needs the same environment, and the key team."
                 )
+        if len({role.name for role in self.teams}) < len(self.teams):
+            raise ValueError("two teams have the same name. Give each team's file its own name.")
         return self
 
     @model_validator(mode="after")
@@ -207,15 +214,15 @@ class TaskSpec(CheckedModel):
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
 
-def select_states(scored_observation: ScoredObservation, state: State, next_state: State) -> list[State]:
-    """Return the states of a step that `phi` reads, in the order in which factors are concatenated."""
-    return {"before": [state], "after": [next_state], "both": [state, next_state]}[scored_observation]
+def select_sides(scored_observation: ScoredObservation, before: Side, after: Side) -> list[Side]:
+    """Return what `phi` reads of a step's two sides, in the order in which factors are concatenated."""
+    return {"before": [before], "after": [after], "both": [before, after]}[scored_observation]
 
 
-def step_names(scored_observation: ScoredObservation, names: Sequence[str]) -> list[str]:
-    """Return the names of the values that are computed from `select_states`.
+def names_by_side(scored_observation: ScoredObservation, names: Sequence[str]) -> list[str]:
+    """Return the names of the values that are computed from `select_sides`.
 
-    For both states, each name occurs twice: first all as in `speed (before)`, then all as in `speed (after)`.
+    For both sides, each name occurs twice: first all as in `speed (before)`, then all as in `speed (after)`.
     """
     if scored_observation != "both":
         return list(names)
@@ -223,13 +230,15 @@ def step_names(scored_observation: ScoredObservation, names: Sequence[str]) -> l
 
 
 def base_name(step_name: str) -> str:
-    """Return the name without what `step_names` adds."""
+    """Return the name without what `names_by_side` adds."""
     return step_name.removesuffix(" (before)").removesuffix(" (after)")
 
 
 def entry_meanings(text: str) -> dict[int, str]:
     """Return the meanings of the entries of an observation or action by its text: the line `7: angle of the foot` is about entry 7."""
-    lines = re.findall(r"^[ \t\-*\[]*(\d+)\]?[ \t]*[:.)](?!\d)[ \t]*(\S.*)$", text, flags=re.MULTILINE)
+    lines = re.findall(
+        r"^[ \t]*(?:[\-*][ \t]+)*\[?(\d{1,9})\]?[ \t]*[:.)](?!\d)[ \t]*(\S.*)$", text, flags=re.MULTILINE
+    )
     return {int(number): meaning.strip() for number, meaning in lines}
 
 

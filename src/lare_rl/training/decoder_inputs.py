@@ -25,7 +25,7 @@ from lare_rl.latent.factors import NonFiniteFactorError
 from lare_rl.phi.evaluate import evaluate
 from lare_rl.phi.graph import Graph
 from lare_rl.runs.directory import Run
-from lare_rl.tasks.spec import select_states
+from lare_rl.tasks.spec import select_sides
 from lare_rl.util.files import replace_npz
 
 __all__ = [
@@ -58,7 +58,7 @@ def compute_factors(
     lead = steps.next_timestep.terminated.shape
     factors = jnp.zeros((*lead, config.n_proxy_rewards, max(config.n_factors, default=0)), jnp.float32)
     for i, (graph, team) in enumerate(zip(graphs, config.env.teams, strict=False)):
-        timesteps = select_states(config.scored_observation, steps.timestep, steps.next_timestep)
+        timesteps = select_sides(config.scored_observation, steps.timestep, steps.next_timestep)
         inputs = [phi_inputs(config.credit_scope, team, timestep, steps.env_action) for timestep in timesteps]
         columns = jnp.concatenate([_evaluate_graph(graph, *arrays) for arrays in inputs], axis=-1)
         factors = factors.at[..., config.team_slice(i), : columns.shape[-1]].set(columns)

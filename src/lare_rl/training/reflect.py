@@ -22,7 +22,7 @@ from lare_rl.latent.function import LatentFunction
 from lare_rl.latent.improve import Assessment, improve
 from lare_rl.llm.model import Model, ModelFunction, as_model
 from lare_rl.runs.directory import Run
-from lare_rl.tasks.spec import TaskSpec, require_role, select_states
+from lare_rl.tasks.spec import TaskSpec, require_role, select_sides
 from lare_rl.training.stored_episodes import stored_role_episodes
 from lare_rl.util.findings import render
 
@@ -105,14 +105,14 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
         raise LareError(f"{len(episodes)} episodes say too little of a function: {MIN_EXPLAINED_EPISODES} are needed")
     inputs = []
     for episode in episodes:
-        observed = select_states(role.scored_observation, episode.observation, episode.next_observation)
+        observed = select_sides(role.scored_observation, episode.observation, episode.next_observation)
         factors = _compute_factors(function, role, episode)
         inputs.append(np.concatenate([factors, *observed, episode.env_action], axis=-1))
     names = function.factor_columns(role.scored_observation)
     basis = Basis(len(names), inputs[0].shape[-1] - len(names), extended=True)
     alive, returns = [episode.alive for episode in episodes], np.array([episode.return_ for episode in episodes])
     fit = assess_factors(inputs, alive, returns, basis, role.score, _levels(episodes))
-    observation_names = select_states(role.scored_observation, "observation", "next_observation")
+    observation_names = select_sides(role.scored_observation, "observation", "next_observation")
     sizes = dict.fromkeys(observation_names, role.observation_size) | {"action": role.action_size}
     raw_names = raw_feature_names(role.observation, role.action, sizes) if basis.n_raw_used else []
     valid_factors = np.concatenate([rows[mask] for rows, mask in zip(inputs, alive, strict=True)])[:, : len(names)]

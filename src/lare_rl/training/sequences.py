@@ -22,7 +22,7 @@ from lare_rl.data.sampling import EpisodeSample, sample_distinct_episodes
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import team_mean
 from lare_rl.nn.masks import select
-from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, standardise_if_observed, update_mean_std
+from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, standardise_unless_empty, update_mean_std
 from lare_rl.training.decoder_fits import fit_decoders, sample_credit
 from lare_rl.training.decoder_inputs import alive_agents
 from lare_rl.training.episodes import Decoders
@@ -194,7 +194,7 @@ def _sequences(
     n_choices = (*observation.shape[:-1], config.env.action_size)
     return Sequences(
         observation=observation,
-        state=standardise_if_observed(mixer_statistics, _mixer_input(observation, state, config)),
+        state=standardise_unless_empty(mixer_statistics, _mixer_input(observation, state, config)),
         available=all_timesteps("available") if config.env.masks_actions else jnp.ones(n_choices, bool),
         action=steps.columns["action"],
         reward=mask * team_mean(reward, alive_agents(steps, config), config.env.teams[0]),

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.config.effective import unused_settings, warmup_warning
+from lare_rl.config.effective import describe_unused_settings, warmup_warning
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.envs.load import resolve_task
@@ -83,7 +83,7 @@ def train(
     resolved = resolve(settings, task)
     functions = choose_functions(task, resolved, function)
     run = create_run(Path(out) if out is not None else default_directory(task, resolved), task, resolved, functions)
-    unused = list(unused_settings(settings, resolved, task).values())
+    unused = list(describe_unused_settings(settings, resolved, task).values())
     messages = unused[:1] if len(unused) < 2 else [f"{unused[0]} (and {len(unused) - 1} more)"]
     messages += _describe_rounding(resolved, steps=settings.steps, evaluate_every=settings.evaluate_every)
     with lock_run(run), report_full_memory(run), catch_stop_signals() as stop:

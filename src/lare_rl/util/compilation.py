@@ -24,14 +24,14 @@ _PROGRAM_SUFFIX, _TIME_SUFFIX = "-cache", "-atime"
 """JAX writes two files for a program, in this order. Their names end with these suffixes."""
 
 
-def cache_variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return environment variables that turn on the cache, for a process that has not imported JAX yet, and for its children.
+def cache_variables(variables: Mapping[str, str]) -> dict[str, str]:
+    """Prepare the cache, and return the environment variables that turn it on in processes that have not imported JAX yet.
 
     The result is empty if the user has turned the cache off or has chosen one for JAX, or if no cache can be written.
     """
-    if "JAX_COMPILATION_CACHE_DIR" in environment:
+    if "JAX_COMPILATION_CACHE_DIR" in variables:
         return {}
-    return {name.upper(): str(value) for name, value in _cache_settings(environment).items()}
+    return {name.upper(): str(value) for name, value in _prepare_cache(variables).items()}
 
 
 def enable_cache() -> None:
@@ -41,20 +41,20 @@ def enable_cache() -> None:
 
     if jax.config.jax_compilation_cache_dir is not None:  # pyright: ignore[reportAttributeAccessIssue] - JAX makes it at run time
         return
-    for name, value in _cache_settings(os.environ).items():
+    for name, value in _prepare_cache(os.environ).items():
         jax.config.update(name, value)
     compilation_cache.reset_cache()  # JAX asks once whether there is a cache, at its first compilation
 
 
-def _cache_settings(environment: Mapping[str, str]) -> dict[str, str | float]:
-    """Return JAX's settings for a cache for this kind of processor. They are empty if no cache can be used.
+def _prepare_cache(variables: Mapping[str, str]) -> dict[str, str | float]:
+    """Create or repair the cache for this kind of processor, and return JAX's settings for it.
 
-    The directory is created and repaired. JAX's environment variables have the names of the settings in capitals.
+    They are empty if no cache can be used. JAX's environment variables have the names of the settings in capitals.
     """
-    setting = environment.get("LARE_CACHE", "").strip()
-    if setting == "off":
+    setting = variables.get("LARE_CACHE", "").strip()
+    if setting.lower() == "off":
         return {}
-    directory = (Path(setting) if setting else user_cache_path("lare")) / f"compiled-{_processor_hash()}"
+    directory = (Path(setting).expanduser() if setting else user_cache_path("lare")) / f"compiled-{_processor_hash()}"
     try:
         directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         _remove_incomplete_programs(directory)
@@ -72,7 +72,7 @@ def _cache_settings(environment: Mapping[str, str]) -> dict[str, str | float]:
 
 
 def _remove_incomplete_programs(directory: Path) -> None:
-    """Remove programs of which a killed process has written only one file. JAX would fail to read them every time."""
+    """Remove each program of which only one file exists, because a process was killed. JAX would fail whenever it reads it."""
     with FileLock(directory / ".lockfile", timeout=_LOCK_TIMEOUT_S):  # JAX's own lock, so that no process is writing
         programs, times = (
             {file.name.removesuffix(suffix) for file in directory.glob(f"*{suffix}")}

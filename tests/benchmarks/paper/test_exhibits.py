@@ -13,7 +13,7 @@ from lare_rl.errors import LareError
 from lare_rl.llm.recording import shipped_recordings
 from lare_rl.runs.metric_names import CREDIT_ERROR, RETURN, SUMMED_RETURN
 from lare_rl.sweep import processes
-from lare_rl.sweep.jobs import check_job, job_to_json, train_job
+from lare_rl.sweep.jobs import check_job, describe_job, train_job
 from lare_rl.sweep.resources import Resources
 from lare_rl.training import train as training
 from paper.exhibits import LARE_SOURCE, exhibit_jobs, exhibits
@@ -155,7 +155,7 @@ def test_finished_runs_and_remarks_are_kept(make_page, monkeypatch):
 @pytest.mark.long
 def test_train_exhibit(command, monkeypatch, tmp_path):
     """From the command line to the page. The runs are in this process, whose compiler is told to hurry."""
-    monkeypatch.setattr(processes, "train_in_process", lambda job, slot, running: train_job(job_to_json(job)))
+    monkeypatch.setattr(processes, "train_in_process", lambda job, slot, running: train_job(describe_job(job)))
     monkeypatch.setattr(training, "Terminal", lambda: AtStep(-1, None))
     status, out, err = command("reproduce", "errors", "--budget", "smoke")
     assert (status, out) == (0, "wrote results/smoke/errors.md\n"), err

@@ -27,7 +27,7 @@ from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.algorithms.ppo.policies import StochasticPolicy
 from lare_rl.nn.masks import masked_mean
 from lare_rl.nn.networks import MLP, adam_step, clip_gradient, init_adam, init_orthogonal
-from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, running_std, standardise_if_observed, update_mean_std
+from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, running_std, standardise_unless_empty, update_mean_std
 
 __all__ = ["PPO", "Actor", "act", "explore", "get_actor", "init", "logits", "update"]
 
@@ -94,7 +94,7 @@ def get_actor(state: PPO) -> Actor:
 
 def normalise(observation: Observation, observation_rms: RunningMeanStd | None) -> Observation:
     """Return observations as the networks receive them: normalised, if there are statistics."""
-    return observation if observation_rms is None else standardise_if_observed(observation_rms, observation)
+    return observation if observation_rms is None else standardise_unless_empty(observation_rms, observation)
 
 
 def logits(actor: Actor, observation: Observation, available: Available) -> Action:

@@ -20,7 +20,8 @@ class QMIXSettings(SequenceSettings):
     hidden: Count = 64
     """Width of the agents' network and of its memory."""
     monotonic: bool = True
-    """Mix the agents' values by a monotonic network; else add them up (VDN)."""
+    """Whether a monotonic network mixes the values of the agents; else they are added up. The name of the algorithm decides: true for
+    qmix, false for vdn."""
     embed: Count = 32
     """Width of the mixer."""
     hypernet: Count = 64
@@ -40,10 +41,14 @@ class QMIXSettings(SequenceSettings):
     epsilon_steps: Count = 100_000
     """Environment steps in which the probability falls linearly from start to end."""
 
+    @property
+    def unused_names(self) -> tuple[str, ...]:
+        return () if self.monotonic else ("embed", "hypernet")
+
 
 def _run_defaults(env: "EnvSpec", environments: int | None) -> dict[str, Any]:
     return {
-        "method": "lare-rd",  # the paper's: closed-form credit has not been measured with these algorithms
+        "method": "lare-rd",  # as in the paper; closed-form credit has not been measured with QMIX and VDN
         "environments": environments or (8 if env.is_jax else 1),
         "steps": 2_000_000,
         "evaluate_every": 10_000,

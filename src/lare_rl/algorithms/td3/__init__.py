@@ -24,6 +24,10 @@ class TD3Settings(OffPolicySettings):
     exploration_noise: Annotated[float, Field(ge=0)] = 0.1
     """Standard deviation of the noise on actions, in action bounds."""
 
+    @property
+    def unused_names(self) -> tuple[str, ...]:
+        return () if self.policy_noise else ("noise_clip",)
+
 
 _TD3 = Algorithm(
     name="td3",
