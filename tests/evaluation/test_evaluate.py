@@ -11,7 +11,7 @@ from PIL import Image
 import lare_rl
 from helpers.toy_envs import Chase, levels_spec, pick_spec, toy_spec
 from lare_rl.config.resolve import resolve
-from lare_rl.envs.placement import make_host_env
+from lare_rl.envs.placement import load_env_spec, make_host_env
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.errors import LareError, check_count, install_command
 from lare_rl.evaluation import evaluate as module
@@ -30,7 +30,8 @@ from lare_rl.evaluation.evaluate import (
 )
 from lare_rl.evaluation.video import check_video_path, record_video, write_video
 from lare_rl.report.evaluation_lines import compare_actions, describe_evaluation
-from lare_rl.runs.directory import create_run
+from lare_rl.runs.config_file import make_config
+from lare_rl.runs.directory import Run, create_run
 from lare_rl.runs.metric_names import DETERMINISTIC_RETURN
 from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.policy import get_actor
@@ -204,6 +205,17 @@ def test_evaluate_in_another_environment(run, command):
     for name in ("toys/Missing-v0", "other:Chase-v0"):
         with pytest.raises(LareError, match=name):
             evaluate_run(run, environment=name)
+
+
+def test_another_environment_of_several_teams(tmp_path):
+    names = "pettingzoo/helpers.parallel_toy_envs:Capitals", "pettingzoo/helpers.parallel_toy_envs:OtherCapitals"
+    sizes = {"environment": names[0], "observation_size": 2, "action_size": 3}
+    teams = tuple(toy_spec(name=team, team=team, agents=(f"{team}_*",), **sizes) for team in ("Hunter", "Prey"))
+    task = toy_spec(teams=teams, **sizes)
+    run = Run(tmp_path, make_config(task, resolve(lare_rl.Settings(method="dense"), task), ()), ())
+    moved = module.move_evaluations(run, names[1]).config.task
+    assert {role.evaluation_environment for role in (moved, *moved.teams)} == {names[1]}
+    assert [team.name for team in load_env_spec(moved).teams] == ["Hunter", "Prey"]
 
 
 @pytest.mark.parametrize(("gain", "text"), [(1.0, "better"), (-1.0, "worse"), (0.0, None)])

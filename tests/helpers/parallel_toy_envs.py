@@ -92,3 +92,7 @@ class Capitals(Toy):
 class OddNames(Toy):
     def __init__(self, **more):
         super().__init__(("red team_0", 'bl"/ue_0', "😀_0"), **more)
+
+
+class OtherCapitals(Capitals):
+    """The same in which policies are evaluated."""

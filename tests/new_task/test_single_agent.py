@@ -108,7 +108,7 @@ def test_plain_lines():
 
 def test_episode_ends_of_real_environments():
     draft = draft_task("Hopper-v5")
-    assert "height of the hopper" in draft.toml.partition("observation = \"\"\"")[0]
+    assert "height of the hopper" in draft.toml.partition('observation = """')[0]
     assert not any("termination" in title for title in draft.unused_sections)
     draft = draft_task("CarRacing-v3")
     assert any("-100 reward" in line for line in draft.removed)
