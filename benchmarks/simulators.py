@@ -39,6 +39,7 @@ TASKS = {
     "Traffic": Task("traffic signal, PPO", "ppo", "longest queue", -9.27, -26),
     "JobShop": Task("job shop, PPO", "ppo", "most work remaining", -17.87, -27),
     "Grid": Task("power grid, PPO", "ppo", "simulate if loaded", -2.65, -90),
+    "Trains": Task("trains, IPPO", "ippo", "wait while blocked", -4.30, -35),
 }
 METHODS = {
     "episodic": "score at the end",
@@ -113,7 +114,7 @@ def draw(tasks: dict[str, dict[str, list[Lines]]]) -> str:
     From the score at the end, and from the proxy, PPO is drawn with gamma = lambda = 1 where that was trained.
     """
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(13, 3.2), layout="constrained")
+        figure = Figure(figsize=(15, 3.2), layout="constrained")
         for axes, (name, seeds) in zip(np.ravel(figure.subplots(1, len(tasks))), tasks.items(), strict=True):
             task = TASKS[name]
             for method, colour in CURVES.items():

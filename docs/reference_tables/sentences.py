@@ -38,7 +38,7 @@ def metrics_page() -> str:
         "## Which credit metric to trust",
         "`credit/return_r2` is out of sample, but tests sums over episodes: neither single steps nor the division among agents. It is "
         "near 1 whatever the features are if returns depend on the length of episodes. `credit/correlation` and `credit/error` are "
-        "the only use of true rewards. They are in sample, on steps of the method's own policy (IPPO: the newest rollout).",
+        "the only use of true rewards. They are in sample, on steps of the method's own policy.",
     ]
     return "\n\n".join(lines)
 

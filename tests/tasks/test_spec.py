@@ -23,6 +23,11 @@ def test_names_that_are_no_directory(name):
     assert toy_spec(name=".a-1").name == ".a-1"
 
 
+def test_measures_are_no_metrics_of_evaluations():
+    with pytest.raises(LareError, match="'length'"):
+        toy_spec(measures=("speed", "length"))
+
+
 def test_teams_have_names_of_their_own():
     predator, prey = (team_spec(name=name, team=name) for name in ("predator", "prey"))
     assert team_spec(teams=(predator, prey)).roles == (predator, prey)

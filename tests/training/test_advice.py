@@ -124,6 +124,7 @@ def test_greedy_actions_of_newest_states(dense_run):
         ({"td3": {"warmup": 50}}, 60, {}, ("steps so far random", {"step": 60, "warmup": 60})),  # whole iterations
         ({"td3": {"warmup": 60}}, 90, {"critic/loss": 0.0}, None),
         ({"algorithm": "qmix"}, 90, {}, ("too few episodes", {"step": 90, "algorithm": "qmix", "batch_size": 128})),
+        ({"algorithm": "qmix"}, 90, {"actor/objective": 2.0}, None),  # as a plugin names it
         ({"algorithm": "qmix"}, 90, {"critic/loss": 2.0, "critic/loss_prey": None}, None),
     ],
 )

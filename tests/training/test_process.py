@@ -31,6 +31,17 @@ def test_second_signal_ends_process(monkeypatch, capfd):
     assert threading.active_count() == n_threads
 
 
+def test_handler_of_an_embedding_program(monkeypatch):
+    """Python does not know a handler that was installed in C."""
+    handler, install = signal.getsignal(signal.SIGINT), signal.signal
+    with monkeypatch.context() as patch:
+        patch.setattr(signal, "signal", lambda number, handler: install(number, handler) and None)
+        with catch_stop_signals():
+            pass
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+    signal.signal(signal.SIGINT, handler)
+
+
 PROGRAM = """
 import hashlib, lare_rl.training.process as process
 process.SAME_REQUEST_S, process.UNRESPONSIVE_S = 0.2, 0.2

@@ -104,6 +104,15 @@ def test_no_model_is_asked_without_a_reason(episodes):
         assert text in messages[0]
 
 
+def test_directory_of_a_run(dense_run):
+    messages = []
+    function = reflect(
+        verify_function(WRONG, TASK), TASK, ScriptedModel(), episodes=dense_run.directory, on_message=messages.append
+    )
+    assert function.source == WRONG
+    assert "6 episodes" in messages[0]
+
+
 def test_function_may_be_the_model(episodes):
     function = reflect(verify_function(WRONG, TASK), TASK, lambda messages: to_reply(RIGHT), episodes=episodes)
     assert function.source == RIGHT

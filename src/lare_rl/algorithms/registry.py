@@ -7,6 +7,9 @@ module of its functions, which is imported when the algorithm is first used. The
     ROLLOUTS       init, get_actor, act, explore, update                  as in `ppo/ppo.py`
     SEQUENCES      init, get_actor, act, init_memory, epsilon, update     as in `qmix/qmix.py`
 
+`update` returns metrics: those whose names begin with `actor/` or `critic/` say that the policy was updated, and `critic/loss` must be
+finite.
+
 `lare-rl export` also writes the result of `logits(actor, observation, available)`, if the module has this function.
 """
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from lare_rl.algorithms.registry import ALGORITHMS, Algorithm, Consumes
+from lare_rl.algorithms.registry import ALGORITHMS, Algorithm, Consumes, SequenceSettings
 from lare_rl.config.effective import reads_old_steps, unused_names
 from lare_rl.config.settings import ResolvedSettings, Settings, round_up
 from lare_rl.config.train_config import make_train_config
@@ -155,3 +155,12 @@ def _check_size(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Non
         raise LareError(
             f"capacity = {resolved.capacity} is too small: {data} of {task.name} takes up to {min_capacity}"
         )
+    if isinstance(resolved.hyperparameters, SequenceSettings):
+        batch_size, rows = resolved.hyperparameters.batch_size, env.max_steps + 1
+        n_held = resolved.capacity // resolved.environments // rows * resolved.environments
+        if n_held < batch_size:
+            enough = -(-batch_size // resolved.environments) * rows * resolved.environments
+            raise LareError(
+                f"capacity = {resolved.capacity} holds {n_held} of the longest episodes of {task.name}, and an update reads {batch_size}: "
+                f"use a capacity of {enough} or more, or a smaller {resolved.algorithm}.batch_size"
+            )

@@ -46,8 +46,8 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
         "credit/gain": "Share of the squared error of the level's mean return that these predictions remove.",
         "credit/gain_error": "Standard error of `credit/gain`.",
         CREDIT_CORRELATION: (
-            "Pearson's correlation of proxy and true rewards over the newest 5,000 steps. Null if the environment pays only at the "
-            "end."
+            "Pearson's correlation of proxy and true rewards over the newest 5,000 steps or, if all episodes have one length, over those "
+            "of the last iteration. Null if the environment pays only at the end."
         ),
         CREDIT_ERROR: "Mean of |proxy reward - true reward| over these steps, if both have the same unit. Null in the same case.",
         "credit/loss": "Gradient descent: the decoder's loss in units of the squared scale of R/T, mean over the last updates.",
@@ -84,4 +84,4 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
 
 def was_updated(line: Mapping[str, Any]) -> bool:
     """Return whether the policy had been updated before the evaluation of a line of metrics.jsonl."""
-    return line.get("critic/loss") is not None
+    return any(value is not None for name, value in line.items() if name.startswith(("actor/", "critic/")))

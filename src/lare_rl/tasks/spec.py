@@ -66,6 +66,9 @@ MAX_LEVELS = 64
 NO_ENVIRONMENT = "none"
 """The value of `environment` for a task with logs only, whose environment is not available."""
 
+OWN_METRICS = frozenset({"return", "return_std", "deterministic_return", "summed_return", "length"})
+"""Names of an evaluation's own metrics, which no measure may have."""
+
 FILL_IN = "FILL IN"
 """The placeholder in a draft for texts that must be written before a language model reads them."""
 
@@ -149,6 +152,13 @@ class TaskSpec(CheckedModel):
         if stored != _tuples_to_lists(arguments):
             raise ValueError(problem)
         return stored
+
+    @field_validator("measures")
+    @classmethod
+    def _check_measures(cls, measures: tuple[str, ...]) -> tuple[str, ...]:
+        if taken := sorted(OWN_METRICS.intersection(measures)):
+            raise ValueError(f"{taken[0]!r} is a metric of every evaluation. Give the key of info another name.")
+        return measures
 
     @model_validator(mode="after")
     def _check_teams(self) -> "TaskSpec":

@@ -50,9 +50,10 @@ MESSAGES = {
     "its first update ({algorithm}.batch_size)",
     "large observations": (
         "Observations are large: the root mean square of {feature} is {rms:.3g} in the first steps, and {algorithm} does not "
-        "normalise observations. Its actions may stay at their bounds. Let the environment divide each entry by its "
+        "normalise observations.{effect} Let the environment divide each entry by its "
         "range{alternative}."
     ),
+    "actions at bounds": " Its actions may stay at their bounds.",
     "normalise": ", or set --{algorithm}.normalise-observations True",
     "use ppo": ", or use --algorithm ppo, which normalises observations",
     "saturated policies": (
@@ -125,6 +126,7 @@ def find_large_observations(run: Run, replay: Replay, config: TrainConfig) -> li
     sizes = {"observation": config.env.observation_size}
     feature = raw_feature_names(run.config.task.roles[0].observation, "", sizes)[largest]
     values = {"feature": feature, "rms": float(rms[largest]), "algorithm": algorithm, "alternative": alternative}
+    values["effect"] = None if config.env.discrete else Finding("actions at bounds")
     return [Finding("large observations", values)]
 
 

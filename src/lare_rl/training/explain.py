@@ -97,9 +97,9 @@ def compile_explanation(learner: Learner, config: TrainConfig) -> None:
     """Compile `explain_stored_returns` for a learner of these shapes, on one device, also in another thread."""
     if not _can_explain(config):
         return
-    inputs = segments_as_episodes(learner.replay), jax.eval_shape(_score_facts, learner)
-    shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), inputs)
     with jax.enable_x64(True):
+        inputs = segments_as_episodes(learner.replay), jax.eval_shape(_score_facts, learner)
+        shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), inputs)
         _compile(_explanation_config(config)).lower(*shapes).compile()
 
 

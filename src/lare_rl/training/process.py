@@ -64,7 +64,7 @@ def catch_stop_signals() -> Iterator[threading.Event]:
             yield stop
     finally:
         for number, handler in old_handlers.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)  # None: not installed by Python
 
 
 @contextlib.contextmanager

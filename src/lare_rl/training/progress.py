@@ -38,7 +38,7 @@ class Listener(Protocol):
         """Steps have been made: after an iteration and its updates, and once a second while a long one collects on the host."""
 
     def on_evaluation(self, metrics: MetricLines) -> None:
-        """An evaluation has been made. Its lines of metrics.jsonl and the checkpoint have been written."""
+        """An evaluation has been made. Its lines of metrics.jsonl have been written; the checkpoint may still be being written."""
 
     def on_message(self, message: str) -> None:
         """The run has a line for the user to read."""

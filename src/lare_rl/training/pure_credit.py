@@ -38,7 +38,7 @@ from lare_rl.training.decoder_fits import fit_repeatedly
 from lare_rl.training.decoder_inputs import compute_factors
 from lare_rl.training.learner import Learner, init_learner, replay_columns, store_with_factors
 from lare_rl.training.rewards import rewards
-from lare_rl.util.float64 import float64
+from lare_rl.util.float64 import float64, require_float32
 
 __all__ = ["CreditSteps", "PureCredit", "PureCreditState", "pure_credit"]
 
@@ -108,7 +108,7 @@ def pure_credit(
         action_size: the length of a continuous action, or the number of discrete actions.
         n_envs: the number of environments.
         n_steps: the steps of each environment that `observe` stores at a time.
-        max_steps: the number of steps of the longest episode. The decoder does not learn from longer ones.
+        max_steps: the number of steps of the longest episode. From longer ones nothing is learned, or wrong steps.
         discrete: whether actions are discrete.
         agents: the number of agents of a team, which shares its return.
         low: the lower bounds of continuous actions in the environment's units, which `phi` reads.
@@ -122,6 +122,7 @@ def pure_credit(
     Raises:
         LareError: the arguments do not go together.
     """
+    require_float32()
     counts = {"observation_size": observation_size, "action_size": action_size, "n_envs": n_envs, "n_steps": n_steps}
     counts |= {"max_steps": max_steps, "agents": agents, "capacity": capacity, "fit_updates": fit_updates}
     for name, value in counts.items():

@@ -21,7 +21,7 @@ from lare_rl.errors import LareError, check_count
 from lare_rl.latent.function import LatentFunction
 from lare_rl.latent.improve import Assessment, improve
 from lare_rl.llm.model import Model, ModelFunction, as_model
-from lare_rl.runs.directory import Run
+from lare_rl.runs.directory import Run, as_run
 from lare_rl.tasks.spec import TaskSpec, require_role, select_sides
 from lare_rl.training.stored_episodes import stored_role_episodes
 from lare_rl.util.findings import render
@@ -40,7 +40,7 @@ def reflect(
     model: Model | ModelFunction,
     rounds: int = 1,
     *,
-    episodes: Sequence[Episode] | Run | None = None,
+    episodes: Sequence[Episode] | Run | str | Path | None = None,
     policy: Policy | None = None,
     record: Path | None = None,
     on_message: Callable[[str], None] = lambda _: None,
@@ -54,7 +54,7 @@ def reflect(
         function: a function from `lare_rl.design`, or written by hand.
         task: the task of the function: a name, a path, or a spec.
         model: the language model, as for `lare_rl.design`.
-        episodes: whole episodes, or a run whose stored episodes are used; by default, 40 are played.
+        episodes: whole episodes, or a run or its directory, whose stored episodes are used; by default, 40 are played.
         policy: plays the episodes instead of random actions: a function from an observation of a single agent (and the mask of
             available actions, if the environment has one) to an action.
         record: a file to record every exchange in; if the design was recorded, the same file.
@@ -69,7 +69,7 @@ def reflect(
     def load_episodes() -> Sequence[Episode]:
         if episodes is None:
             return play_episodes(role, N_EPISODES, policy)
-        return stored_role_episodes(episodes, role) if isinstance(episodes, Run) else episodes
+        return stored_role_episodes(as_run(episodes), role) if isinstance(episodes, Run | str | Path) else episodes
 
     def judge(function: LatentFunction) -> Assessment:
         assessment = assess_function(function, role, load_episodes())

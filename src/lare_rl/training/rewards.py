@@ -19,6 +19,7 @@ from lare_rl.envs.interface import Team, team_mean
 from lare_rl.nn.masks import masked_mean
 from lare_rl.training.decoder_inputs import alive_agents, step_batch
 from lare_rl.training.learner import Learner
+from lare_rl.util.statistics import FLOAT32_NOISE
 
 __all__ = ["accuracy_metrics", "assess", "masked_correlation", "mean_absolute_error", "rewards", "team_metrics"]
 
@@ -102,8 +103,15 @@ def masked_correlation(
     r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], mask: Bool[Array, " steps"]
 ) -> Float[Array, ""]:
     """Return Pearson's correlation over the steps where `mask` is true, or NaN where one of the two never varies."""
-    x, y = ((values - masked_mean(values, mask)) * mask for values in (r_hat, reward))
+    x, y = (_deviations(values, mask) for values in (r_hat, reward))
     return jnp.clip(jnp.sum(x * y) / jnp.sqrt(jnp.sum(x**2) * jnp.sum(y**2)), -1, 1)  # rounding can exceed 1
+
+
+def _deviations(values: Float[Array, " steps"], mask: Bool[Array, " steps"]) -> Float[Array, " steps"]:
+    """Return the deviations from the mean. Those of equal values are 0, without the rounding errors of the mean."""
+    mean = masked_mean(values, mask)
+    deviations = (values - mean) * mask
+    return jnp.where(jnp.max(jnp.abs(deviations)) > FLOAT32_NOISE * jnp.abs(mean), deviations, 0)
 
 
 def team_metrics(metrics: list[dict[str, Any]], teams: Sequence[Team]) -> dict[str, Any]:

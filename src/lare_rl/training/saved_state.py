@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Int
 
@@ -44,7 +45,10 @@ def load_learner(run: Run, n_devices: int = 1) -> SavedState:
     config = make_train_config(run.config.task, run.config.settings, run.functions, n_devices)
     try:
         learner, metadata, arrays = checkpoint.load(run.checkpoint, learner_shape(config, len(run.seeds)))
-        return SavedState(replace(config, batched=metadata.get("batched", False)), learner, metadata, arrays)
+        batched = (
+            metadata.get("batched", False) and jax.default_backend() != "cpu"
+        )  # as in `compiled.is_batching_faster`
+        return SavedState(replace(config, batched=batched), learner, metadata, arrays)
     except LareError as error:
         if run.config.lare == code_version():
             raise

@@ -43,6 +43,7 @@ from lare_rl.training.evaluation import greedy_actions, metrics_lines, saturatio
 from lare_rl.training.explain import compile_explanation
 from lare_rl.training.learner import Learner, abandon_episodes
 from lare_rl.training.policy import actor_shape, get_actor
+from lare_rl.training.rewards import team_metrics
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import count_seed_devices
 from lare_rl.training.streams import Stream, seed_keys, stream_keys
@@ -230,7 +231,9 @@ class Session:
         # compiled.
         if is_last and is_sampled and isinstance(self.collector, HostCollector):
             deterministic = self.collector.evaluate(actor, n_episodes, deterministic=True)
-            metrics[DETERMINISTIC_RETURN] = deterministic.returns[..., 0].mean(axis=1)
+            means = deterministic.returns.mean(axis=1)
+            teams = self.config.env.teams
+            metrics |= team_metrics([{DETERMINISTIC_RETURN: means[:, i]} for i in range(len(teams))], teams)
         if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
             metrics[ACTOR_SATURATION] = saturation(greedy_actions(actor, self.learner.replay, self.config))
         check_losses(self.latest_metrics, self.run.seeds, self.step)

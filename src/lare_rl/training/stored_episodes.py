@@ -32,7 +32,7 @@ def stored_episodes(run: Run | str | Path, seed: int | None = None) -> list[Log]
     Each is a mapping as `lare_rl.relabel` and `numpy.savez` take it, for an episode of T steps:
 
         observations    [T + 1 observation]      the last one is that after the last step
-        actions         [T action]               in the units of the environment; [T], integers, if actions are discrete
+        actions         [T action]               in the units of the environment; [T], integers from 0, if actions are discrete
         rewards         [T]                      the true ones
         terminations    [T]                      TD3, DDPG and SAC: whether the episode ended by itself
         truncations     [T]                      TD3, DDPG and SAC: whether it reached its time limit

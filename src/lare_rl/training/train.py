@@ -31,6 +31,7 @@ from lare_rl.training.seed_axis import first_shard
 from lare_rl.training.session import Session, restore_session, start_session
 from lare_rl.util import compilation
 from lare_rl.util.findings import Finding, render
+from lare_rl.util.float64 import require_float32
 
 __all__ = ["RunInterruptedError", "resume", "run_session", "train"]
 
@@ -164,6 +165,7 @@ def _finish(
         listener.on_message(
             f"preparing {run.directory}: compiling takes about half a minute, or about ten seconds if it was done before"
         )
+    require_float32()
     compilation.enable_cache()
     is_new = not run.has_checkpoint()
     session, restore_messages = (start_session(run), []) if is_new else restore_session(run)
