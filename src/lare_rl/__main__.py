@@ -10,6 +10,8 @@ def main() -> None:
     try:
         from lare_rl import cli
     except LareError as error:
+        if "--debug" in sys.argv[1:]:
+            raise
         if sys.stderr is not None:  # it was closed by the caller
             sys.stderr.write(f"lare-rl: {error}\n")
         sys.exit(error.status)

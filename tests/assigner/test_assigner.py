@@ -23,6 +23,7 @@ from helpers.toy_envs import pick_spec
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.assigner.decoder_learner import MAX_PENDING_UPDATES
 from lare_rl.assigner.explain import explain
+from lare_rl.credit import decoder_state
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
@@ -154,6 +155,32 @@ def test_no_step_is_paid_for_the_start_value_of_a_sum(start_value, phi):
     error = np.abs(credit.rewards_at(np.arange(len(reward))) - reward).max()
     assert (credit.score_type == "sum", error < 0.05) == (start_value, start_value)
     assert credit.metrics()["credit/return_r2"] > 0.9 or not start_value
+
+
+@pytest.mark.parametrize("groups", [False, True])
+def test_gradient_decoders_pay_no_step_for_the_start_value(groups):
+    settings = SMALL_CREDIT.model_copy(update={"score": "auto", "learning_rate": 0.01, "steps": 100})
+    credit = small_assigner("rd", settings=settings, groups=groups)
+    episodes = random_episodes([14, 3, 8, 5] * 15)
+    for i, (*steps, reward) in enumerate(episodes):
+        credit.add_episode(*steps, reward.sum() - 50 + 0.5 * groups * (i % 2) * len(reward), group=i % 2 if groups else None)
+        if i % 10 == 9:
+            credit.fit(150)
+    assert credit.score_type == "sum"
+    reward = np.concatenate([episode.reward for episode in episodes])
+    assert np.abs(credit.rewards_at(np.arange(len(reward))) - reward).mean() < 0.5
+    assert credit.metrics()["credit/return_r2"] > 0.8
+
+
+def test_start_value_of_long_episodes():
+    credit, random = (
+        small_assigner("bayes", settings=SMALL_CREDIT.model_copy(update={"score": "auto"}), capacity=400_000),
+        np.random.default_rng(0),
+    )
+    for length in random.integers(2900, 3100, size=60):
+        *steps, _ = random_episode(length, random)
+        credit.add_episode(*steps, 0.01 * steps[2][:, 0].sum() + 0.1 * random.normal() + 100)
+    assert float(decoder_state.start_value(credit.learner.decoder)) == pytest.approx(100, abs=1)
 
 
 @pytest.mark.parametrize(("setting", "score"), [("auto", "sum"), ("auto", "average"), ("average", "sum")])

@@ -86,7 +86,7 @@ def design(
         if reflect:
             function = lare_rl.reflect(function, spec, model, reflect, policy=play, **outputs)
     if out is None:
-        _print_function(function, find_free_path(Path(), spec.name, ".py"))
+        print_source(function.source, function.save, find_free_path(Path(), spec.name, ".py"))
     else:
         _save_function(function, out, _next_command(task, spec, out, kind, data))
 
@@ -170,17 +170,6 @@ def _save_attempts(error: "DesignError", new_path: Path) -> None:
             print_progress(f"every attempt is kept in {path}")
             return
     print_line(recorder.to_json(model))
-
-
-def _print_function(function: "LatentFunction", new_path: Path) -> None:
-    """Print a function. If that fails, save it, because the model's replies were paid for."""
-    try:
-        print_line(function.source)
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        function.save(new_path)
-        raise LareError(f"nothing can be printed ({error.strerror}); the function is kept in {new_path}") from error
 
 
 def _save_function(function: "LatentFunction", out: Path, next_command: str) -> None:

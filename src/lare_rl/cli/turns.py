@@ -102,9 +102,9 @@ def turn_phi(
     live_model = live.open(model)
     with after_requests("turns", live_model, live):
         designed = design_turn_phi(goal, descriptions, turns, live_model, record=record)
+    text = f"# A phi over turns, by {one_line(designed.model)}.\n{designed.phi.source}\n".encode()
     if out is None:
-        print_line(designed.phi.source)
+        print_source(designed.phi.source, lambda path: write_bytes(path, text), find_free_path(Path(), "turns", ".py"))
         return
-    text = f"# A phi over turns, by {one_line(designed.model)}.\n{designed.phi.source}\n"
-    write_bytes(out, text.encode())
+    write_bytes(out, text)
     print_line(f"wrote {out} and {record}")

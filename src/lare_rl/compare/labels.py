@@ -1,6 +1,7 @@
 """The rows of a comparison: which runs have the same label, and how the runs of different labels differ."""
 
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,7 @@ from lare_rl.config.effective import effective_settings
 from lare_rl.credit.methods import METHODS
 from lare_rl.runs.config_file import Config
 from lare_rl.runs.directory import Run
+from lare_rl.util.safe_io import read_text
 
 __all__ = ["ORIGINS", "find_differences", "find_origin_differences", "label_runs"]
 
@@ -121,12 +123,21 @@ def _find_function_differences(runs: Sequence[Run]) -> list[Difference]:
 
 
 def _split_by_function(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Split runs with equal settings by their latent functions, unless these differ only from draw to draw."""
+    """Split runs with equal settings by their latent functions, unless these are recorded ones that differ only from draw to draw."""
     draws = [(run.config.task.name, run.config.settings.draw) for run in runs]
-    functions = {(draw, run.config.function_sha256) for draw, run in zip(draws, runs, strict=True)}
-    if len(functions) == len(set(draws)):
+    functions = [run.config.function_sha256 for run in runs]
+    by_task = {(task, function) for (task, _), function in zip(draws, functions, strict=True)}
+    has_one_per_task = len(by_task) == len({task for task, _ in draws})
+    has_one_per_draw = len(set(zip(draws, functions, strict=True))) == len(set(draws))
+    if has_one_per_task or (has_one_per_draw and not any(map(_has_given_function, runs))):
         return {label: list(runs)}
     return group_pairs((f"{label}, phi {_function_name(run)}", run) for run in runs)
+
+
+def _has_given_function(run: Run) -> bool:
+    """Return whether the user gave the functions of a run. The first lines of a recorded one name its draw (`LatentFunction.save`)."""
+    recorded = re.compile(rf"^# lare: model: .*, draw {run.config.settings.draw}$", re.MULTILINE)
+    return any(not recorded.search(read_text(path)) for path in run.directory.glob("latent_function*.py"))
 
 
 def _split_by_directory(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:

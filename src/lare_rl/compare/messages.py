@@ -17,11 +17,11 @@ MESSAGES = {
     # Runs and tables (`collect.py`).
     "no_evaluation": "{run} is left out: it has no evaluation yet.",
     "no_metric": "{run} is left out: it has no {metric}.",
-    "unfinished": "{run} has only reached step {step:,} of {steps:,}: no run is compared at a later step.",
+    "unfinished": "{run} has only reached step {step:,} of {steps:,}: no run of its task is compared at a later step.",
     "untrained": "{run}: {reason}",
     "mean_over_agents": "Returns are means over the agents. --metric {metric} compares their sums.",
     "other_task": "{source} is left out: its task is {task}, and that of the runs {tasks}.",
-    "other_steps": "{source} has no {metric} of {label} at step {step:,} for every seed: no run is compared there.",
+    "other_steps": "{source} has no {metric} of {label} at step {step:,} for every seed: no run of this task is compared there.",
     "differ": "The runs differ in {differences}.",
     "origin": "All runs: {facts}.",
     # Scores.

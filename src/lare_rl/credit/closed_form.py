@@ -62,6 +62,7 @@ __all__ = [
     "reward_std",
     "select_score_type",
     "split_double",
+    "target_scale",
     "to_float64",
 ]
 
@@ -217,7 +218,7 @@ def fit(
     """
     basis = state.decoder.basis
     groups, strengths = _fit_linear_types(state, score_types, max_rounds, batched=batched)
-    weights = _linear_weights(basis, groups, strengths)
+    weights = _linear_weights(basis, groups, strengths, _start_value_unit(state))
     if ScoreType.AVERAGE in score_types and not fixed_length:
         weights = _centre_average(state, weights, score_types.index(ScoreType.AVERAGE))
     posterior, strengths = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (groups, strengths))
@@ -247,8 +248,21 @@ def _fit_linear_types(
 
 
 def _score_type_statistics(state: ClosedForm, score_type: Int[Array, ""] | int) -> SufficientStatistics:
+    """Return the sums for a fit. Its columns must have about the same size, so 1/T is divided by its mean."""
     statistics, basis = to_float64(state.sufficient_statistics), state.decoder.basis
-    return drop_start_value(statistics, basis.n_features, score_type) if basis.start_value else statistics
+    if not basis.start_value:
+        return statistics
+    unit = jnp.ones(len(statistics.mean)).at[basis.n_features].set(_start_value_unit(state))
+    products = statistics.products * jnp.outer(unit, unit)
+    return drop_start_value(
+        statistics._replace(mean=statistics.mean * unit, products=products), basis.n_features, score_type
+    )
+
+
+def _start_value_unit(state: ClosedForm) -> Float[Array, ""]:
+    """Return what the column 1/T is multiplied by, the inverse of its mean."""
+    mean = to_float64(state.sufficient_statistics).mean[state.decoder.basis.n_features]
+    return 1 / jnp.where(mean > 0, mean, 1)
 
 
 def drop_start_value(
@@ -259,11 +273,15 @@ def drop_start_value(
     return statistics._replace(products=jnp.where(jnp.outer(is_used, is_used), statistics.products, 0))
 
 
-def _linear_weights(basis: Basis, groups: Posterior, strengths: Posterior) -> _Weights:
+def _linear_weights(
+    basis: Basis, groups: Posterior, strengths: Posterior, start_value_unit: Float[Array, ""]
+) -> _Weights:
     best = relevance.select(strengths, groups, basis.column_group_index, basis.column_strength_index)
     if basis.prefixes:  # b is the weight of the number of steps; the bias is V_0, which no step is paid for
         return _Weights(best.weight, best.weight[:, basis.n_features], best.bias)
-    start_value = best.weight[:, basis.n_features] if basis.start_value else jnp.zeros_like(best.bias)
+    start_value = jnp.zeros_like(best.bias)
+    if basis.start_value:
+        start_value = start_value_unit * best.weight[:, basis.n_features]
     return _Weights(best.weight, best.bias, start_value)
 
 
@@ -281,6 +299,21 @@ def _centre_average(state: ClosedForm, weights: _Weights, index: int) -> _Weight
 def _log_odds_weights(log_odds: LogOddsFit) -> _Weights:
     start_value, slope = logistic.to_returns(log_odds)
     return _Weights(slope * log_odds.posterior.weight[None], jnp.zeros(1), start_value[None])
+
+
+def target_scale(state: ClosedForm, *, is_average: Bool[Array, ""], index: Int[Array, ""] | int) -> Float[Array, ""]:
+    """Return the root mean square of (R - start value)/T or, of an average, of R - start value. Call this within `float64()`.
+
+    Episodes have the weight T. `index` is the position of the score type among all that are fitted.
+    """
+    statistics, basis = to_float64(state.sufficient_statistics), state.decoder.basis
+    mean, start = statistics.mean, state.start_value[index]
+    moments = statistics.products / jnp.maximum(statistics.n_steps, 1) + jnp.outer(mean, mean)
+    of_average = moments[-1, -1] - 2 * start * mean[-1] + start**2
+    of_sum, column = moments[-2, -2], basis.n_features  # 1/T
+    if basis.start_value:
+        of_sum = of_sum - 2 * start * moments[column, -2] + start**2 * moments[column, column]
+    return jnp.sqrt(jnp.maximum(jnp.where(is_average, of_average, of_sum), 0))
 
 
 def reward_std(

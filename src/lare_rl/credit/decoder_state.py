@@ -108,6 +108,8 @@ class DecoderState(NamedTuple):
     """The scale of R/T."""
     return_scale: Scale
     """The scale of R."""
+    target_scale: Float[Array, ""]
+    """The scale of what steps are paid for, if the score has a start value and the decoder is fitted by gradient descent; else 0."""
     is_average: Bool[Array, ""]
     """Whether the score is treated as an average over the steps. r_hat is then the output of the decoder, divided by T."""
     is_log_odds: Bool[Array, ""]
@@ -117,7 +119,8 @@ class DecoderState(NamedTuple):
     closed_form: ClosedForm | None
     """Present for a decoder in closed form, and for any decoder if the score type must be determined."""
     levels: LevelStatistics | None
-    """Means of R/T by level. Present for a decoder that is fitted by gradient descent, if episodes have levels."""
+    """Means of R/T by level, for a decoder that is fitted by gradient descent to episodes with levels. A closed form, if there is one, has
+    the intercepts instead."""
     score_type_predictions: Predictions | None
     """Predictions of returns by closed-form fits of all score types. Present if the score type must be determined."""
 
@@ -133,17 +136,19 @@ def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
     network = FirstInput() if method.fit is None else method.decoder_kind.load_init()(key, spec)
     _check_network(network, spec)
     n_types = len(spec.score_types)
+    has_level_means = basis.n_levels > 0 and method.uses_gradient and not spec.has_closed_form
     return DecoderState(
         network=network,
         optimizer=init_adam(network, spec.settings.learning_rate) if method.uses_gradient else (),
         statistics=normalise.empty_mean_std(basis.n_standardised),
         scale=normalise.empty_scale(),
         return_scale=normalise.empty_scale(),
+        target_scale=jnp.zeros(()),
         is_average=jnp.asarray(spec.score_types == (ScoreType.AVERAGE,)),
         is_log_odds=jnp.asarray(False),
         predictions=empty_predictions(1, spec.window),
         closed_form=closed_form.init(basis, spec.score_types) if spec.has_closed_form else None,
-        levels=empty_level_statistics(basis.n_levels) if basis.n_levels and method.uses_gradient else None,
+        levels=empty_level_statistics(basis.n_levels) if has_level_means else None,
         score_type_predictions=empty_predictions(n_types, spec.window) if n_types > 1 else None,
     )
 
@@ -226,7 +231,7 @@ def level_returns(
         return value
     if state.levels is not None:
         return value + level_offsets(state.levels)[level] * length
-    if closed is None or state.closed_decoder is None:
+    if closed is None:
         return value
     per_step = ~(state.is_average | state.is_log_odds | closed.decoder.basis.prefixes)
     return value + closed.intercept[index][level] * jnp.where(per_step, length, 1)
@@ -245,11 +250,15 @@ def level_effects(state: DecoderState, mean_length: float, n_levels: int) -> Flo
 
 
 def reward_unit(state: DecoderState, spec: CreditSpec) -> Float[Array, ""]:
-    """Return the unit of the decoder's output: the root mean square of R/T, or of R if the score is an average."""
+    """Return the unit of the decoder's output: the root mean square of R/T, or of R if the score is an average.
+
+    A start value is subtracted first. It may be much larger than what steps are paid for.
+    """
     if not spec.normalises:
         return jnp.ones(())
     return_unit, mean_unit = map(normalise.root_mean_square, (state.return_scale, state.scale))
-    return jnp.where(state.is_average, return_unit, mean_unit)
+    unit = jnp.where(state.is_average, return_unit, mean_unit)
+    return jnp.where(state.target_scale > 0, state.target_scale, unit)
 
 
 def normalise_inputs(

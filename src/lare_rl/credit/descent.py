@@ -137,8 +137,6 @@ def _targets(state: DecoderState, episodes: CreditBatch, spec: CreditSpec) -> Fl
 
     The part of R that no step is credited with (`level_returns`) is subtracted.
     """
-    mean_reward = episodes.mean_reward
-    if episodes.level is not None:
-        level_return = decoder_state.level_returns(state, episodes.level, episodes.length)
-        mean_reward = mean_reward - level_return / jnp.maximum(episodes.length, 1)
+    unpaid = decoder_state.level_returns(state, episodes.level, episodes.length)
+    mean_reward = episodes.mean_reward - unpaid / jnp.maximum(episodes.length, 1)
     return mean_reward * jnp.where(state.is_average, episodes.length, 1) / decoder_state.reward_unit(state, spec)

@@ -86,7 +86,7 @@ def assess_factors(
     later_returns = returns[N_FIRST:]
     with float64():
         features, state = add_episodes(inputs, alive, returns, replace(basis, start_value=True))
-        columns = np.hstack([features, 1 / length[:, None], one_hot])
+        columns = np.hstack([features, length.mean() / length[:, None], one_hot])  # of about the same size
         column, n_features = np.arange(columns.shape[1]), features.shape[1]
         predict = partial(predict_returns, returns=returns, length=length, basis=with_levels)
         fits = [predict(columns, score_type=score_type) for score_type in score_types]
@@ -108,7 +108,7 @@ def assess_factors(
         if level is not None:
             levels_alone = np.where(column >= n_features, columns, 0)
             level_r2 = r_squared(later_returns, predict(levels_alone, score_type=score_type)[0])[0]
-        start_value = weight[basis.n_factor_features]
+        start_value = length.mean() * weight[basis.n_factor_features]
         explained = jax.tree.map(np.asarray, _explain(state, score_type, start_value))
     r2, r2_error = r_squared(later_returns, predicted)
     return FactorAssessment(r2, r2_error, length_r2, level_r2, score_type=estimate, explanation=explained)
@@ -160,8 +160,8 @@ def predict_returns(
 ) -> tuple[Float[np.ndarray, " later_episodes"], Float[np.ndarray, " used_columns"]]:
     """Return R_hat of all episodes but the first `N_FIRST`, each by a fit to episodes before it, and the weights of the last fit.
 
-    Call this within `float64()`. `columns` are the mean features of each episode, 1/T, and which level it has. Functions of raw features
-    are not used.
+    Call this within `float64()`. `columns` are the mean features of each episode, a multiple of 1/T, and which level it has. Functions of
+    raw features are not used.
     """
     features, group_index = columns[:, _is_used(basis)], basis.column_group_index[_is_used(basis)]
     state = evidence.empty_statistics(len(group_index)), evidence.init_posterior(group_index)

@@ -191,10 +191,11 @@ def fit_closed_form(state: DecoderState, spec: CreditSpec, *, batched: bool = Fa
     state = state._replace(closed_form=closed)
     if state.score_type_predictions is not None:
         state = _choose_score_type(state, state.score_type_predictions, score_types)
+    index = decoder_state.score_type_index(state, len(score_types))
     if not spec.method.uses_gradient:
-        index = decoder_state.score_type_index(state, len(score_types))
-        state = state._replace(network=closed_form.select_score_type(closed.decoder, index))
-    return state
+        return state._replace(network=closed_form.select_score_type(closed.decoder, index))
+    scale = closed_form.target_scale(closed, is_average=state.is_average, index=index)
+    return state._replace(target_scale=jnp.where(closed.start_value[index] != 0, scale, 0).astype(jnp.float32))
 
 
 def _choose_score_type(

@@ -37,6 +37,7 @@ SAVED_BY_ROW = f"{REPLAY}columns"
 """The path of the arrays that are saved by row."""
 ZERO_IF_MISSING = (
     *(".closed_form.strengths.", ".closed_form.intercept", ".closed_form.start_value"),
+    ".target_scale",
     *(".is_log_odds", ".is_average", ".predictions.level", ".score_type_predictions.level"),
 )
 """Paths of arrays that earlier checkpoints do not have. Zeros mean that they have not been computed yet, or make no difference."""

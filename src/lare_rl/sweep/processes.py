@@ -102,7 +102,8 @@ def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | N
     """Train a job in a new process, which writes its output to RUN.log. Return the error, or None."""
     make_directory(job.directory.parent)
     log = job.directory.with_name(job.directory.name + ".log")
-    request = json.dumps({"job": describe_job(job), "cores": slot.cores})
+    if slot.cores:  # of this thread. The process inherits them before NumPy starts threads.
+        os.sched_setaffinity(0, slot.cores)
     with log.open("a", encoding="utf-8") as file:
         log_start = file.tell()
         # In its own session, so that Ctrl-C reaches it only once, through this process.
@@ -122,7 +123,7 @@ def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | N
         assert process.stdout is not None
         try:
             with contextlib.suppress(OSError, ValueError):  # the process has ended, or `stop` has closed its input
-                process.stdin.write(request + "\n")
+                process.stdin.write(json.dumps(describe_job(job)) + "\n")
                 process.stdin.flush()
             error = process.stdout.read().strip()
             process.wait()
@@ -160,7 +161,7 @@ def train_on_ray(
     try:
         quiet: dict[str, Any] = {"log_to_driver": False, "include_dashboard": False, "logging_level": logging.ERROR}
         ray.init(None if address == "local" else address, **quiet)
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except Exception as error:  # Ray raises `Exception` itself if a node does not start
         raise LareError(f"there is no Ray cluster at {address}: {error}") from error
     try:
         accelerators = resources.accelerators or 0
@@ -193,11 +194,8 @@ def main() -> None:
     line = sys.stdin.readline()
     if not line:  # it was stopped already
         sys.exit(130)
-    request = json.loads(line)
     threading.Thread(target=_interrupt_at_end_of_input, daemon=True).start()
-    if request["cores"]:
-        os.sched_setaffinity(0, request["cores"])
-    if (error := _train_when_free(request["job"])) is not None:
+    if (error := _train_when_free(json.loads(line))) is not None:
         for stream in (sys.stderr, to_parent):  # if one fails (a full disk, a dead parent), the other may work
             with contextlib.suppress(OSError):
                 stream.write(f"{error}\n")

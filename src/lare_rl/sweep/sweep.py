@@ -110,7 +110,10 @@ def run_sweep(
                 if error:
                     failed.append(job)
     except KeyboardInterrupt:
-        raise RunInterruptedError("stopped; all running runs were saved, and the same command continues them") from None
+        saved = "all running runs were saved, and the same command continues them"
+        if ray is not None:  # which does not ask them to save
+            saved = "the same command continues the runs from their last checkpoints"
+        raise RunInterruptedError(f"stopped; {saved}") from None
     return failed
 
 

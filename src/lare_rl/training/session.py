@@ -47,7 +47,7 @@ from lare_rl.training.rewards import team_metrics
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import count_seed_devices
 from lare_rl.training.streams import Stream, seed_keys, stream_keys
-from lare_rl.util.float64 import load_linear_algebra, one_blas_thread
+from lare_rl.util.blas import load_linear_algebra, one_blas_thread
 from lare_rl.util.npz import DAMAGED_FILE_ERRORS
 
 __all__ = ["Session", "restore_session", "start_session"]

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from threadpoolctl import threadpool_limits
 
 from lare_rl.errors import LareError, check_count, short_repr
 from lare_rl.turns.features import COUNT, HAPPENED, LAST, Prefixes, TurnTable, build_prefixes, tabulate
@@ -16,6 +15,7 @@ from lare_rl.turns.rollouts import Phi, read_rollouts
 from lare_rl.turns.trust import UNTRUSTED, Errors, Trust, choose_lambda, group_means, measure_errors, summarise
 from lare_rl.turns.value import advantages, changes, fit_prefixes, held_out_values, posterior_stds, values
 from lare_rl.turns.words import MESSAGES, count_decimals
+from lare_rl.util.blas import one_blas_thread
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import CLEAR_ERRORS
 
@@ -151,8 +151,7 @@ class TurnCredit:
             raise LareError("there are no rollouts: credit needs some, and several of each group")
         return self.assign(tabulate(checked))
 
-    # The matrices are small: several threads would mostly wait for each other (`util/float64.py`).
-    @threadpool_limits.wrap(limits=1, user_api="blas")
+    @one_blas_thread()
     def assign(self, table: TurnTable) -> CreditedTurns:
         """Return the credit of turns that are arrays already.
 

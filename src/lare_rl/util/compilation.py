@@ -31,7 +31,8 @@ def cache_variables(variables: Mapping[str, str]) -> dict[str, str]:
     """
     if "JAX_COMPILATION_CACHE_DIR" in variables:
         return {}
-    return {name.upper(): str(value) for name, value in _prepare_cache(variables).items()}
+    settings = {name.upper(): str(value) for name, value in _prepare_cache(variables).items()}
+    return {name: value for name, value in settings.items() if name not in variables}
 
 
 def enable_cache() -> None:

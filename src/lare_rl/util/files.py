@@ -91,6 +91,12 @@ def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
 
     Raises `LareError` if the file cannot be written.
     """
+    if (
+        path.exists() and not path.is_file() and not path.is_dir()
+    ):  # a device, such as /dev/null, or a pipe is never replaced
+        with report_write_error(path), path.open("wb") as file:
+            write(file)
+        return
     new = path.with_name(f"{path.name}.{uuid4().hex}.new")  # unique: another process may write the same file
     try:
         with new.open("wb") as file:
