@@ -8,6 +8,7 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
 
 from helpers.assigner_episodes import (
     SMALL_CREDIT,
@@ -21,10 +22,10 @@ from helpers.assigner_episodes import (
 from helpers.long_tests import long_case
 from helpers.toy_envs import pick_spec
 from lare_rl.assigner.assigner import CreditAssigner
-from lare_rl.assigner.decoder_learner import MAX_PENDING_UPDATES
+from lare_rl.assigner.decoder_learner import MAX_FIRST_UPDATES
 from lare_rl.assigner.explain import explain
 from lare_rl.credit import decoder_state
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
@@ -163,7 +164,9 @@ def test_gradient_decoders_pay_no_step_for_the_start_value(groups):
     credit = small_assigner("rd", settings=settings, groups=groups)
     episodes = random_episodes([14, 3, 8, 5] * 15)
     for i, (*steps, reward) in enumerate(episodes):
-        credit.add_episode(*steps, reward.sum() - 50 + 0.5 * groups * (i % 2) * len(reward), group=i % 2 if groups else None)
+        credit.add_episode(
+            *steps, reward.sum() - 50 + 0.5 * groups * (i % 2) * len(reward), group=i % 2 if groups else None
+        )
         if i % 10 == 9:
             credit.fit(150)
     assert credit.score_type == "sum"
@@ -222,7 +225,7 @@ def test_fit_pending_makes_chunks_of_updates_and_not_too_many():
     eager = small_assigner("rd", fits_per_step=100.0)
     add_episode(eager, episode)
     eager.fit_pending()
-    assert eager.learner.n_updates == MAX_PENDING_UPDATES
+    assert eager.learner.n_updates == MAX_FIRST_UPDATES
 
 
 def test_forget_is_false_for_logs():
@@ -666,3 +669,58 @@ def test_must_learn_what_wins():
     assert correlation > 0.95
     assert any("log odds" in line for line in odds.explanation())
     assert [any("won or lost" in line for line in credit.explanation()) for credit in (sums, odds)] == [True, False]
+
+
+def test_finished_episodes_are_learned_before_they_are_overwritten():
+    credit = small_assigner(capacity=100, forget=False)
+    add_episodes(credit, random_episodes([20] * 40))
+    credit.fit(1)
+    assert credit.learner.n_learned == 40
+
+
+def test_restored_assigner_keeps_what_it_learned(tmp_path):
+    """Also if its steps were not saved, and the statistics of its inputs change."""
+    credit = small_assigner("bayes")
+    add_episodes(credit, random_episodes([10] * 60))
+    credit.fit()
+    credit.save(tmp_path / "saved", episodes=False)
+    loaded = CreditAssigner.load(tmp_path / "saved")
+    far = random_episode(10, np.random.default_rng(1))
+    loaded.add_episode(far.observation + 9, far.action, far.next_observation + 9, far.reward)
+    loaded.fit()
+    assert float(loaded.learner.decoder.closed_form.n_fitted) == 61
+
+
+def test_residuals_of_pending_steps():
+    """The first steps of an episode are asked for while its last ones have no inputs yet."""
+    credit = small_assigner("bayes", settings=SMALL_CREDIT.model_copy(update={"exact": "spread"}))
+    add_episodes(credit, random_episodes([10] * 30))
+    credit.fit()
+    step_ids = credit.add_episode(*random_episodes([10], seed=1)[0])
+    first = credit.rewards_at(step_ids[:2])
+    np.testing.assert_array_equal(credit.rewards_at(step_ids)[:2], first)
+    assert credit.rewards_at(step_ids).sum() == pytest.approx(random_episodes([10], seed=1)[0].reward.sum(), rel=1e-4)
+
+
+def test_pending_updates_are_one_for_each_step():
+    credit = small_assigner("rrdu", settings=SMALL_CREDIT)
+    add_episodes(credit, random_episodes([100] * 4))
+    credit.fit_pending()
+    n_first = credit.learner.n_updates
+    assert n_first == 256  # a long start makes no burst
+    add_episodes(credit, random_episodes([100] * 4, seed=1))
+    credit.fit_pending()
+    assert credit.learner.n_updates == n_first + 400
+
+
+def test_defaults_of_many_agents_remain():
+    spaces = {"observation_space": 2, "action_space": 1}
+    credit = CreditAssigner("rrdu", agents=3, max_steps=9, settings=CreditSettings(score="sum"), **spaces)
+    assert (credit.config.settings.steps, credit.config.settings.score) == (MULTI_AGENT_CREDIT.steps, "sum")
+
+
+def test_single_row_of_a_box_with_an_axis_of_one():
+    spaces = {"observation_space": Box(-1, 1, (1, 2), np.float32), "action_space": 1}
+    credit = CreditAssigner("bayes", **spaces)
+    rows = np.zeros((1, 2), np.float32)
+    assert credit.add(rows, np.zeros((1, 1)), rows, [0.0], [True], [False]).shape == (1,)

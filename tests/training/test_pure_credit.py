@@ -10,7 +10,7 @@ import pytest
 from jax.sharding import PartitionSpec
 
 import lare_rl
-from lare_rl.credit.decoder_settings import CreditSettings, default_credit
+from lare_rl.credit.decoder_settings import CreditSettings, resolve_credit
 from lare_rl.errors import LareError
 from lare_rl.training.pure_credit import CreditSteps, pure_credit
 
@@ -96,7 +96,7 @@ def test_invalid_factors_are_counted_and_not_used(phi):
 @pytest.mark.long
 def test_functions_are_mapped_over_seeds():
     """`vmap` within `shard_map` gives what single calls give: the rewards of many agents behind the returns."""
-    settings = default_credit(3).model_copy(update={"score": "sum"})
+    settings = resolve_credit(None, 3).model_copy(update={"score": "sum"})
     credit = pure_credit("bayes", **SIZES, settings=settings, agents=3)
     make, keys = partial(make_steps, agents=(3,)), jax.random.split(jax.random.key(0), 2)
     steps, true_reward = make(jax.random.key(1))

@@ -68,7 +68,7 @@ class CreditAssigner:
                 no credit.
             phi: for the methods that need one: those whose names begin with `lare-`, and `llm-reward`.
             task: the task that `phi` was designed for: a name, a path, or a spec. It decides spaces and `scored_observation` if you do
-                not give them.
+                not give them; of a task without an environment not the space of actions.
             observation_space: the space of a single agent in a single environment, or the length of an observation.
             action_space: the same for actions. Actions are in the environment's units.
             scored_observation: the observations of a step that factors and raw features are computed from: "before", "after" or

@@ -12,7 +12,7 @@ from pydantic import Field, InstanceOf
 
 from lare_rl.assigner.space_layout import SpaceLayout, make_layout
 from lare_rl.config.validity import check_credit, check_factors
-from lare_rl.credit.decoder_settings import CreditSettings, default_credit
+from lare_rl.credit.decoder_settings import CreditSettings, resolve_credit
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import METHODS, Method
@@ -23,7 +23,7 @@ from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import CheckedModel, Count, LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
-from lare_rl.tasks.spec import ScoredObservation, TaskSpec
+from lare_rl.tasks.spec import NO_ENVIRONMENT, ScoredObservation, TaskSpec
 
 __all__ = ["AssignerConfig", "Space", "check_config", "resolve_config"]
 
@@ -133,7 +133,7 @@ def resolve_config(
     chosen = METHODS.find(method or ("bayes" if phi is None else "lare-bayes"))
     if phi is not None and not isinstance(phi, LatentFunction):
         raise LareError(f"phi is {short_repr(phi)}: give a function from lare_rl.design or lare_rl.load_function")
-    settings = default_credit(agents) if settings is None else CreditSettings.model_validate(settings)
+    settings = resolve_credit(settings, agents)
     if settings.score == "auto" and task is not None and (score := find_score_type(task)) is not None:
         settings = settings.model_copy(update={"score": score})
     observation, action = _resolve_layouts(task, spaces)
@@ -160,8 +160,13 @@ def _resolve_layouts(task: TaskSpec | None, spaces: Mapping[str, Space | None]) 
             raise LareError("CreditAssigner needs observation_space and action_space, or a task")
         size = getattr(task, f"{name}_size", 0)
         if space is None:
-            is_choice = name == "action" and task is not None and load_env_spec(task).discrete
-            space = gymnasium.spaces.Discrete(size) if is_choice else size
+            if name == "action" and task is not None and task.environment == NO_ENVIRONMENT:
+                raise LareError(
+                    f"task {task.name!r} has no environment: give action_space, a Gymnasium space or the length of an action"
+                )
+            env = load_env_spec(task) if name == "action" and task is not None else None
+            is_choice = env is not None and env.discrete
+            space = gymnasium.spaces.Discrete(size, start=env.first_choice) if is_choice else size
         layout = make_layout(space, f"{name}_space")
         if task is not None and layout.size != size:
             raise LareError(

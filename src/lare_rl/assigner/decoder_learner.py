@@ -35,8 +35,8 @@ MAX_PENDING_STEPS = 256
 """The most steps that may wait for their inputs, or for the running statistics."""
 CHUNK_UPDATES = 16
 """Gradient updates of a decoder in one call."""
-MAX_PENDING_UPDATES = 256
-"""The most gradient updates that may wait. This limits the burst of updates after a long first episode."""
+MAX_FIRST_UPDATES = 256
+"""The most gradient updates that may wait for the first episode. This limits the burst of updates after a long one."""
 PHI_SAMPLE_STEPS = 256
 """About how many steps `phi` is verified on, after it is loaded from a file."""
 
@@ -80,10 +80,15 @@ class DecoderLearner:
     ) -> Int[np.ndarray, " steps"]:
         """Store new steps, and return their numbers. Raises `LareError` if they are more than the capacity."""
         n_steps = len(observation)
+        oldest = self.store.n_added + n_steps - self.store.capacity
+        if any(episode.step_ids[0] < oldest for episode in chain.from_iterable(self._pending_episodes)):
+            self.learn_returns()  # before these episodes are overwritten
         step_ids = self.store.add(n_steps, alive)
         self._pending_steps.append((step_ids, observation, action, next_observation))
         self.n_pending_steps += n_steps
-        self._pending_updates = min(self._pending_updates + self.config.fits_per_step * n_steps, MAX_PENDING_UPDATES)
+        self._pending_updates += self.config.fits_per_step * n_steps
+        if not self.n_updates:
+            self._pending_updates = min(self._pending_updates, MAX_FIRST_UPDATES)
         return step_ids
 
     def queue_episodes(self, episodes: Iterable[StoredEpisode]) -> None:
@@ -195,8 +200,10 @@ class DecoderLearner:
         closed = decoder.closed_form
         if closed is None:
             return decoder
-        # Sums that are computed anew lack the episodes that are not stored any more.
-        may_rebuild = self.config.forget or self.store.oldest_step == 0
+        # Sums that are computed anew lack the episodes that are not stored: those that were overwritten, which may be forgotten, and all
+        # earlier ones after a load without episodes.
+        are_all_stored = len(self.store.episodes) == self.store.n_ended
+        may_rebuild = are_all_stored or (self.config.forget and self.store.oldest_step > 0)
         if self.config.method.fit is not Fit.SIGNS and may_rebuild and compiled.is_stale(closed, decoder.statistics):
             closed = compiled.reset_statistics(closed, decoder.statistics)
             pending = set(map(id, chain.from_iterable(self._pending_episodes)))

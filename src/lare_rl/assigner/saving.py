@@ -113,7 +113,10 @@ def read_state(directory: Path) -> AssignerState:
     task = None if values["task"] is None else TaskSpec(**values["task"])
     phi = None
     if task is not None and values["phi"]:
-        phi = load_function(directory / FUNCTION_FILE, task, steps=_phi_sample(arrays))
+        # A task may have no environment that plays random steps. `phi` is also verified on numbers that are not the environment's.
+        sizes = task.observation_size, task.action_size
+        zeros = np.zeros((1, sizes[0]), np.float32), np.zeros((1, sizes[1]), np.float32)
+        phi = load_function(directory / FUNCTION_FILE, task, steps=_phi_sample(arrays) or zeros)
     if isinstance(values["settings"], dict):
         values["settings"].setdefault("start_value", False)  # of an earlier version
     fields = {name: values[name] for name in AssignerConfig.model_fields.keys() & values.keys()}

@@ -64,7 +64,7 @@ class SpaceLayout(CheckedModel):
         if self.kind == "choices":
             return self._one_hot(array, name)
         lead = array.shape[: array.ndim - len(self.shape)]
-        if self.kind == "numbers" and array.shape == (*lead, *self.shape):
+        if self.kind == "numbers" and lead and array.shape == (*lead, *self.shape):
             return _to_float32(array.reshape(*lead, self.size))
         return self._check_rows(array, name)
 

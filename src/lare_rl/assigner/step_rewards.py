@@ -37,9 +37,9 @@ class StepRewards:
         """Return the rewards of stored steps. Raises `LareError` if a step is not stored."""
         store = self.store
         rows = store.rows(step_ids)
-        if len(rows) and step_ids.max() >= store.n_added - self.learner.n_pending_steps:
+        is_exact = self.config.spec.is_exact and self.learner.is_fitted  # a residual reads all steps of an episode
+        if len(rows) and (is_exact or step_ids.max() >= store.n_added - self.learner.n_pending_steps):
             self.learner.flush_inputs()
-        is_exact = self.config.spec.is_exact and self.learner.is_fitted
         last, residual = self._residuals(step_ids, rows) if is_exact else (np.zeros(len(rows), bool), None)
         return self._compute(
             inputs=store.inputs[rows],

@@ -6,7 +6,7 @@ from pydantic import AliasChoices, Field
 
 from lare_rl.errors import CheckedModel, Count
 
-__all__ = ["MULTI_AGENT_CREDIT", "RECENT_STEPS", "CreditSettings", "default_credit"]
+__all__ = ["MULTI_AGENT_CREDIT", "RECENT_STEPS", "CreditSettings", "resolve_credit"]
 
 RECENT_STEPS = 5000
 """Proxy rewards are compared with the true rewards over this number of newest steps of each agent."""
@@ -67,6 +67,8 @@ MULTI_AGENT_CREDIT = CreditSettings(
 """The default settings of decoders for many agents. The numbers are those of LaRe's published code, except VIB's divergence."""
 
 
-def default_credit(agents: int) -> CreditSettings:
-    """Return the default settings of a decoder for one agent or many."""
-    return CreditSettings() if agents == 1 else MULTI_AGENT_CREDIT
+def resolve_credit(settings: CreditSettings | None, agents: int) -> CreditSettings:
+    """Return the settings that were set, and the defaults of a decoder for one agent or many for all others."""
+    defaults = CreditSettings() if agents == 1 else MULTI_AGENT_CREDIT
+    changes = {} if settings is None else CreditSettings.model_validate(settings).model_dump(exclude_unset=True)
+    return defaults.model_copy(update=changes)

@@ -76,6 +76,10 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
     if config.env.discrete and not config.team_level:  # for `exported.reward`, which makes one-hot rows of choices
         choices = {"first": config.env.first_choice, "count": config.env.action_size}
         descriptions |= {name: {**descriptions[name], "choices": choices} for name in graphs if name != "policy"}
+    if (
+        config.env.choice_sizes
+    ):  # the policy returns the number of a combination: np.unravel_index(number, choice_sizes)
+        descriptions["policy"] = {**descriptions["policy"], "choice_sizes": config.env.choice_sizes}
     origin = {"method": settings.method, "algorithm": settings.algorithm, "seed": run.seeds[seed_index], "step": step}
     with new_directory(out) as new:
         _write_files(new, graphs, {"lare": code_version(), "task": task.name, **origin, **descriptions})

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lare_rl.algorithms.registry import Consumes
 from lare_rl.config.train_config import CreditConfig
 from lare_rl.config.validity import check_training
-from lare_rl.credit.decoder_settings import CreditSettings, default_credit
+from lare_rl.credit.decoder_settings import CreditSettings, resolve_credit
 from lare_rl.credit.methods import METHODS, Method, Reward
 from lare_rl.data.replay import StoredSteps, mean_length, required_capacity, segments_as_episodes
 from lare_rl.data.trajectory import Trajectory
@@ -131,7 +131,7 @@ def pure_credit(
         raise LareError(f"scored_observation = {short_repr(scored_observation)}: give 'before', 'after' or 'both'")
     if not isinstance(settings, CreditSettings | None):
         raise LareError(f"settings must be a lare_rl.CreditSettings, and are {short_repr(settings)}")
-    chosen, credit = METHODS.find(method), settings or default_credit(agents)
+    chosen, credit = METHODS.find(method), resolve_credit(settings, agents)
     phi = _check_phi(chosen, phi, (observation_size, action_size))
     env = EnvSpec(
         teams=(Team("agent", 0, agents),),
