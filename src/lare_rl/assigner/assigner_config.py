@@ -165,8 +165,9 @@ def _resolve_layouts(task: TaskSpec | None, spaces: Mapping[str, Space | None]) 
                     f"task {task.name!r} has no environment: give action_space, a Gymnasium space or the length of an action"
                 )
             env = load_env_spec(task) if name == "action" and task is not None else None
-            is_choice = env is not None and env.discrete
-            space = gymnasium.spaces.Discrete(size, start=env.first_choice) if is_choice else size
+            space = size
+            if env is not None and env.discrete:
+                space = gymnasium.spaces.Discrete(size, start=env.first_choice)
         layout = make_layout(space, f"{name}_space")
         if task is not None and layout.size != size:
             raise LareError(
@@ -186,8 +187,6 @@ def check_config(config: AssignerConfig) -> None:
             raise LareError(f"{name} needs a phi; bayes, rd and rrdu need none")
     elif not method.needs_phi:
         raise LareError(f"{name} needs no phi: leave it out, or use lare-bayes")
-    elif phi.kind != method.phi_kind:
-        raise LareError(f"{name} needs a phi of the kind {method.phi_kind!r}, and this one is of the kind {phi.kind!r}")
     elif config.task is None:
         raise LareError("a phi needs the task that it was designed for: CreditAssigner(..., phi, task=task)")
     else:

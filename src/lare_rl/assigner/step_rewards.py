@@ -14,7 +14,7 @@ from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.batches import whole_episodes
 from lare_rl.assigner.compiled_functions import call_chunks, on_cpu
 from lare_rl.assigner.decoder_learner import DecoderLearner
-from lare_rl.credit import decoder_state
+from lare_rl.credit import decoder_state, logistic
 from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.methods import Reward
 from lare_rl.credit.rewards import StepBatch
@@ -124,16 +124,24 @@ class StepRewards:
         residuals.update(zip(new, np.subtract(scores, predicted).tolist(), strict=True))
         return np.array([residuals[number] for number in numbers], np.float32)
 
-    def unpaid_return(self, level: int | None, length: Int[np.ndarray, " payments"]) -> float:
-        """Return the sum of what no proxy reward contains of each payment of an episode: that of its level, or of all episodes.
+    def predicted_return(
+        self, predicted: Float[np.ndarray, " payments"], level: int | None, length: Int[np.ndarray, " payments"]
+    ) -> float:
+        """Return the return of an episode, as the decoder predicts it.
 
-        `level` is None if it is unknown. `length` has the number of steps of each payment.
+        Args:
+            predicted: the sum of the proxy rewards of each payment.
+            level: the level of the episode, or None if it is unknown.
+            length: the number of steps of each payment.
         """
         decoder = self.learner.decoder
         if not self.learner.is_fitted:
-            return 0.0
+            return float(predicted.sum())
         size = padded_size(len(length))
         with on_cpu():
             levels = None if level is None else jnp.full(size, level)
-            values = decoder_state.level_returns(decoder, levels, jnp.asarray(pad_rows(length, size)))
-        return float(np.sum(np.asarray(values)[: len(length)]))
+            unpaid = decoder_state.level_returns(decoder, levels, jnp.asarray(pad_rows(length, size)))[: len(length)]
+            total = jnp.asarray(predicted) + unpaid
+            if decoder.is_log_odds and decoder.closed_form is not None and decoder.closed_form.log_odds is not None:
+                total = logistic.from_linear(decoder.closed_form.log_odds, total)
+        return float(np.sum(np.asarray(total, np.float64)))

@@ -20,6 +20,7 @@ from lare_rl.cli.terminal import (
     print_error,
     print_line,
     print_progress,
+    print_source,
 )
 from lare_rl.errors import LareError
 from lare_rl.llm.prompts import FunctionKind

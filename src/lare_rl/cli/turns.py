@@ -7,9 +7,9 @@ import tyro
 from tyro.conf import Positional
 
 from lare_rl.cli.design import after_requests, check_function_files
-from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_messages
+from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_messages, print_source
 from lare_rl.errors import LareError
-from lare_rl.util.files import check_new_path, write_bytes
+from lare_rl.util.files import check_new_path, find_free_path, write_bytes
 from lare_rl.util.sanitize import one_line
 
 

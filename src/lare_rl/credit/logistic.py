@@ -36,6 +36,7 @@ __all__ = [
     "add_episodes",
     "covariance",
     "fit",
+    "from_linear",
     "init",
     "predict",
     "remove_episodes",
@@ -175,6 +176,13 @@ def to_returns(state: LogOddsFit) -> tuple[Float[Array, ""], Float[Array, ""]]:
     variance = jnp.sum(difference**2)
     slope = jnp.where(variance > 0, difference @ (expected - expected_mean) / jnp.where(variance > 0, variance, 1), 0)
     return expected_mean + slope * (state.posterior.bias - mean), slope
+
+
+def from_linear(state: LogOddsFit, linear: Float[Array, " episodes"]) -> Float[Array, " episodes"]:
+    """Return the expected returns of episodes by their linear predictions a + c w . x (see `to_returns`)."""
+    (start_value, slope), (_, low, high) = to_returns(state), _valid_range(state)
+    log_odds = state.posterior.bias + (linear - start_value) / jnp.where(slope == 0, 1, slope)
+    return jnp.where(slope == 0, linear, low + (high - low) * jax.nn.sigmoid(log_odds))
 
 
 def covariance(state: LogOddsFit) -> PosteriorCovariance:

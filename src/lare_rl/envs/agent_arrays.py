@@ -14,7 +14,7 @@ from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.envs.spaces import check_spaces, flatten_value, float_array
 from lare_rl.errors import LareError, short_repr
 
-__all__ = ["Agent", "AgentArrays", "make_agent"]
+__all__ = ["Agent", "AgentArrays", "integer_dtype", "make_agent"]
 
 MASK = "action_mask"
 """PettingZoo's key for the mask of available actions, in the observation's dictionary or in `info`."""
@@ -50,7 +50,7 @@ class Agent:
         if isinstance(space, Discrete):
             return int(space.start) + int(np.argmax(action))
         clipped = np.clip(action.reshape(space.shape), space.low, space.high)
-        return (np.rint(clipped) if space.dtype.kind in "iu" else clipped).astype(space.dtype)
+        return (np.rint(clipped) if space.dtype.kind in "biu" else clipped).astype(space.dtype)
 
     def flatten_observation(self, observation: Any) -> Float[np.ndarray, " observation"]:
         """Return an observation as a new vector, without the mask. Raises `ValueError` like `flatten_value`."""
@@ -76,6 +76,11 @@ class Agent:
         if not mask.any():
             raise ValueError("is 0 for all actions")
         return mask.astype(bool)
+
+
+def integer_dtype(space: Box) -> np.dtype | None:
+    """Return the type of the elements of a Box that are rounded, or None."""
+    return space.dtype if space.dtype is not None and space.dtype.kind in "biu" else None
 
 
 def make_agent(name: Any, observation: gymnasium.Space, action: gymnasium.Space) -> Agent:
@@ -131,6 +136,11 @@ class AgentArrays:
     def make_spec(self, teams: tuple[Team, ...], **fields: Any) -> EnvSpec:
         """Return the sizes and bounds of an environment with these agents. `fields` are further fields of `EnvSpec`."""
         low, high = self.bounds
+        starts = {int(agent.action_space.start) for agent in self.agents if isinstance(agent.action_space, Discrete)}
+        if len(starts) == 1:
+            fields = {"first_choice": starts.pop(), **fields}
+        if len(self.agents) == 1 and isinstance(space := self.agents[0].action_space, Box):
+            fields = {"package_shape": space.shape, "package_dtype": integer_dtype(space), **fields}
         return EnvSpec(
             teams=teams,
             observation_size=self.observation_size,

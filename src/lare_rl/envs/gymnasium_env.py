@@ -10,7 +10,7 @@ from gymnasium.spaces import Box, Discrete
 from jaxtyping import Float
 
 from lare_rl.envs import mujoco_rewards
-from lare_rl.envs.agent_arrays import Agent
+from lare_rl.envs.agent_arrays import Agent, integer_dtype
 from lare_rl.envs.env_errors import (
     close_env,
     convert_output,
@@ -88,7 +88,8 @@ class GymnasiumEnv:
         assert isinstance(action_space, Discrete | Box)
         self._agent = Agent("agent", self.environment.observation_space, action_space, observes_mask=False)
         if isinstance(action_space, Box):
-            fields: dict[str, Any] = {"low": action_space.low[None], "high": action_space.high[None]}
+            bounds = action_space.low[None], action_space.high[None]
+            fields: dict[str, Any] = {"low": bounds[0], "high": bounds[1], "package_dtype": integer_dtype(action_space)}
         else:
             fields = {"first_choice": int(action_space.start)}
         self.spec = EnvSpec(

@@ -85,6 +85,8 @@ class EnvSpec:
     """The number of values of each component of a `MultiDiscrete` action. The discrete actions are all their combinations."""
     package_shape: tuple[int, ...] | None = None
     """The shape of an action for the environment's package. By default, discrete actions are numbers, continuous ones vectors."""
+    package_dtype: np.dtype | None = None
+    """The type of continuous actions for the environment's package, if it is one of integers: they are rounded."""
     agent_names: tuple[str, ...] = field(default=(), compare=False)
     """The environment's names of the agents, for messages."""
     entry_meanings: Mapping[int, str] = field(default_factory=dict, compare=False)
@@ -212,9 +214,11 @@ def to_package_action(action: Float[AnyArray, "*batch action"], spec: EnvSpec) -
 
     A one-hot vector becomes the number of its action, or the numbers of all components of a `MultiDiscrete` action.
     """
-    if not spec.discrete:
-        return action if spec.package_shape is None else action.reshape(*action.shape[:-1], *spec.package_shape)
     xp = action.__array_namespace__()
+    if not spec.discrete:
+        if spec.package_dtype is not None:
+            action = xp.rint(action).astype(spec.package_dtype)
+        return action if spec.package_shape is None else action.reshape(*action.shape[:-1], *spec.package_shape)
     number = xp.argmax(action, axis=-1)
     if not spec.choice_sizes:
         return number + spec.first_choice

@@ -70,9 +70,17 @@ def check_environment(spec: TaskSpec) -> None:
     if spec.environment == NO_ENVIRONMENT:
         check_logs(spec)
         return
-    load_env_spec(spec)
-    if spec.evaluation_environment is not None:
-        load_env_spec(spec.evaluation_task)
+    env = load_env_spec(spec)
+    if spec.evaluation_environment is None:
+        return
+    other = load_env_spec(spec.evaluation_task)
+    for name in ("n_agents", "observation_size", "action_size", "discrete"):
+        sizes = getattr(env, name), getattr(other, name)
+        if sizes[0] != sizes[1]:
+            raise LareError(
+                f"task {spec.name!r}: {name} is {sizes[0]} in {spec.environment}, and {sizes[1]} in {spec.evaluation_environment}: both "
+                "need the same"
+            )
 
 
 def _read_values(task: str, ancestors: tuple[str, ...] = (), overrides: Mapping[str, Any] = {}) -> dict[str, Any]:

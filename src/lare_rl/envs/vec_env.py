@@ -95,7 +95,8 @@ class LocalVecEnv(VecEnv):
 
     def _call(self, command: str, arguments: Shaped[np.ndarray, "n *rest"], where: Bool[np.ndarray, " n"]) -> None:
         for index in np.flatnonzero(where).tolist():
-            call_env(index, self._envs[index], command, arguments[index], self.batch)
+            # A copy: an environment may change its action in place.
+            call_env(index, self._envs[index], command, np.copy(arguments[index]), self.batch)
 
     def close(self) -> None:
         for index, env in enumerate(self._envs):
@@ -177,6 +178,13 @@ def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: T
                 if name not in measures:
                     raise EnvOutputError(f"{owner}: the measure {name!r} is not in EnvSpec.measures")
                 measures[name][env_index] = value
+            missing = sorted(measures.keys() - new_measures.keys())
+            if missing and (
+                timestep.terminated or timestep.truncated
+            ):  # that of an earlier episode is still in the batch
+                raise EnvOutputError(
+                    f"{owner}: the last step has no measure {missing[0]!r}, which EnvSpec.measures has"
+                )
     except EnvOutputError as error:
         error.env_index = env_index
         raise

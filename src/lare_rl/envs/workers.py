@@ -5,6 +5,7 @@ Gymnasium's AsyncVectorEnv has a process for each environment, steps all or none
 
 import atexit
 import contextlib
+import math
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -144,19 +145,27 @@ class SubprocVecEnv(VecEnv):
 
     def _receive(self, command: str) -> list[tuple[Worker, Any]]:
         """Wait for all busy workers, and return them with their replies."""
-        replies = []
+        replies, stopped_at = [], math.inf
         while busy := [worker for worker in self._workers if worker.is_busy]:
-            timeout = min(self.timeout, STOP_TIMEOUT_S) if self.stop_requested() else self.timeout
-            deadline = min(worker.last_active for worker in busy) + timeout
-            wait_s = min(POLL_S, max(0.0, deadline - time.monotonic()))
+            if self.stop_requested():
+                stopped_at = min(stopped_at, time.monotonic())
+            limits = [self._latest_reply(worker, stopped_at) for worker in busy]
+            wait_s = min(POLL_S, max(0.0, min(limits) - time.monotonic()))
             ready = wait([worker.connection for worker in busy], wait_s)
-            for worker in busy:
+            for worker, limit in zip(busy, limits, strict=True):
                 if worker.connection in ready:
                     replies.append((worker, worker.receive()))
-                elif worker.measure_idle_s() > timeout:
-                    advice = "if it needs longer, set timeout in the task file"
-                    raise LareError(f"{worker.label} did not reply for {timeout:g} s in {command}; {advice}")
+                elif time.monotonic() > max(limit, self._latest_reply(worker, stopped_at)):
+                    seconds, advice = self.timeout, "if it needs longer, set timeout in the task file"
+                    if stopped_at < math.inf:
+                        seconds, advice = STOP_TIMEOUT_S, "the run was asked to stop, and cannot be saved"
+                    raise LareError(f"{worker.label} did not reply for {seconds:g} s in {command}; {advice}")
         return replies
+
+    def _latest_reply(self, worker: Worker, stopped_at: float) -> float:
+        """Return the time at which a worker is given up. After a request to stop it has `STOP_TIMEOUT_S`."""
+        active_at = time.monotonic() - worker.measure_idle_s()
+        return min(active_at + self.timeout, max(active_at, stopped_at) + STOP_TIMEOUT_S)
 
     def close(self) -> None:
         """End the workers, or let them wait for the next batch with the same `reuse_key`."""

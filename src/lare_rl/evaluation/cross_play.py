@@ -70,8 +70,8 @@ def _play_match(
     team = config.env.teams[0]
     policy = partial(combine_policies, policy=make_policy(config, deterministic=False), team=team)
     batch = unroll_on_device(env, (first, second), key[None], n_episodes, config, deterministic=False, act=policy)
-    reward = team_mean(batch.steps.next_timestep.reward, batch.steps.timestep.alive, team)
-    return jnp.mean(jnp.sum(reward * batch.mask, axis=0))
+    reward = jnp.where(batch.mask[..., None], batch.steps.next_timestep.reward, 0)  # after the end, it may be NaN
+    return jnp.mean(jnp.sum(team_mean(reward, batch.steps.timestep.alive, team), axis=0))
 
 
 def combine_policies(

@@ -1,6 +1,6 @@
 """The credit that a run's decoders give to the steps of its last training episode."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -74,7 +74,7 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
     @jax.jit
     def read_rewards(learner: Learner, index: Index) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
         steps = replay.read(learner.replay, index)
-        return steps, rewards(steps, learner.decoders, config)
+        return steps, rewards(steps, learner.decoders, replace(config, scale_rewards=False))
 
     steps, training_reward = read_rewards(learner, index)
     reward = np.asarray(steps.columns["reward"])
@@ -83,7 +83,7 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
         training_reward=np.asarray(training_reward),
         uncertainty=_uncertainty(steps, learner.decoders[0], config),
         factors=np.asarray(steps.columns.get("factors", np.zeros((len(reward), 1, 0)))),
-        has_step_rewards=bool(reward[:-1].any()),
+        has_step_rewards=bool(reward[~np.asarray(steps.last)].any()),
         correlations=_factor_correlations(state.learner, config),
     )
 

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from lare_rl.envs.families import make_local_env
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.interface import Frame, HostEnv
 from lare_rl.envs.jax_on_host import JaxOnHost
@@ -146,7 +148,8 @@ def _encode(images: Sequence[Any], file_format: str, frame_seconds: float, **opt
 
 def _record_on_host(run: Run, policy: RunPolicy, max_fps: float, max_frames: int | None) -> tuple[list[Frame], float]:
     camera = {"camera_name": "track", **FRAME_SIZE} if _has_tracking_camera(run) else {}
-    with closing(make_host_env(run.config.task, render_mode="rgb_array", **camera)) as env:
+    task = run.config.task.evaluation_task
+    with closing(make_host_env(task, render_mode="rgb_array", **camera)) as env:
         metadata = env.environment.metadata if isinstance(env, GymnasiumEnv) else {}
         fps = metadata.get("render_fps", DEFAULT_FPS)
         interval = max(1, math.ceil(fps / max_fps))
@@ -155,11 +158,11 @@ def _record_on_host(run: Run, policy: RunPolicy, max_fps: float, max_frames: int
 
 def _play_and_draw(run: Run, policy: RunPolicy, max_frames: int) -> list[Frame]:
     """Play an episode of an environment in JAX. Draw the states in which the policy acts, or some of them if there are many."""
-    env = make_host_env(run.config.task)
+    env = make_local_env(run.config.task)
     assert isinstance(env, JaxOnHost)
     states = _play_and_capture(run, env, policy, lambda: env.state)
     states = states[:: math.ceil(len(states) / max_frames)]
-    return env.env.frames(jax.tree.map(lambda *leaves: np.stack(leaves), *states))
+    return env.env.frames(jax.device_get(jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)))
 
 
 def _play_and_capture(
@@ -191,8 +194,8 @@ def _render(env: HostEnv, run: Run) -> Frame:
             # Graphics libraries warn if they find no screen, although another library may need none.
             warnings.simplefilter("ignore")
             pixels = np.asarray(env.render())
-        if pixels.ndim != 3:
-            raise ValueError("render returns no picture (height, width, 3)")
+        if pixels.ndim != 3 or pixels.dtype != np.uint8 or pixels.shape[2] not in (3, 4):
+            raise ValueError(f"render returns {pixels.dtype} {pixels.shape}, no picture (height, width, 3) of uint8")
         return pixels
     except Exception as error:  # every graphics library has a different error for a missing display
         raise LareError(
@@ -202,7 +205,7 @@ def _render(env: HostEnv, run: Run) -> Frame:
 
 def _has_tracking_camera(run: Run) -> bool:
     """Return whether the environment is a MuJoCo model with a camera that follows it. Gymnasium does not use it by default."""
-    with closing(make_host_env(run.config.task)) as env:
+    with closing(make_host_env(run.config.task.evaluation_task)) as env:
         if not isinstance(env, GymnasiumEnv):
             return False
         model: Any = getattr(env.environment.unwrapped, "model", None)

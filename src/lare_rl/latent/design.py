@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lare_rl.envs.load import resolve_task
-from lare_rl.errors import LareError, check_count
+from lare_rl.errors import LareError, check_count, short_repr
 from lare_rl.latent.function import LatentFunction, function_from_verdict, normalise_source
 from lare_rl.latent.verify import Check, Steps, Verdict, sample_steps, verify
 from lare_rl.llm import prompts
@@ -16,6 +16,7 @@ from lare_rl.llm.prompts import MAX_ATTEMPTS, MAX_CANDIDATES, N_CANDIDATES, Func
 from lare_rl.llm.recording import Recorder
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec, require_role
+from lare_rl.util.sanitize import replace_surrogates
 
 __all__ = ["Conversation", "DesignError", "check_recorded", "design", "examine_reply", "keep_replies"]
 
@@ -86,6 +87,9 @@ class Conversation:
     def ask(self, stage: Stage, messages: Sequence[Message]) -> str:
         """Return a new reply to a request."""
         reply = self.model.reply(messages, self.recorder.n_replies(stage, messages))
+        if not isinstance(reply, str):
+            raise LareError(f"the model {self.model.name} must return a text, and returned {short_repr(reply)}")
+        reply = replace_surrogates(reply)
         self.recorder.add(stage, messages, reply, self.model.name)
         return reply
 
@@ -185,7 +189,7 @@ def design(
         LareError: there is no such kind, the model cannot answer, the environment does not run, or each team of the task needs
             its own function.
     """
-    task = require_role(resolve_task(task))
+    task = require_role(resolve_task(task, playable=steps is None))
     check_kind(kind)
     candidates = check_count("candidates", candidates)
     if candidates > MAX_CANDIDATES:

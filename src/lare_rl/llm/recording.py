@@ -156,10 +156,11 @@ class Recorder:
 
         `model` is the name of the model that replied. A file has one name: that of its last reply.
         """
-        replies = [reply]
-        if self.exchanges and (self.exchanges[-1].stage, self.exchanges[-1].messages) == (stage, list(messages)):
-            replies = [*self.exchanges.pop().replies, reply]
-        self.exchanges.append(Exchange(stage=stage, messages=list(messages), replies=replies))
+        last = self.exchanges[-1:]
+        is_same = [(exchange.stage, exchange.messages) for exchange in last] == [(stage, list(messages))]
+        earlier = last[0].replies if is_same else []
+        exchange = Exchange(stage=stage, messages=list(messages), replies=[*earlier, reply])  # it may be refused
+        self.exchanges[len(self.exchanges) - is_same :] = [exchange]
         if self.path is not None:
             self.save(self.path, model, new=not self.owns_file)
             self.owns_file = True

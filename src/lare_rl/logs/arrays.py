@@ -30,7 +30,10 @@ class ArrayLog(Log):
         with atomic_output(Path(out), overwrite) as directory:
             directory.mkdir()
             for number, (episode, r_hat) in enumerate(episodes):
-                arrays = {**episode.contents, "rewards": r_hat, "paid": episode.reward}
+                if bad := next((key for key, value in episode.contents.items() if _has_objects(value)), None):
+                    raise LareError(f"{episode.name}: {bad} is no array of numbers or texts: leave it out")
+                contents = {key: _without_objects(value) for key, value in episode.contents.items()}
+                arrays = {**contents, "rewards": r_hat, "paid": episode.reward}
                 with (directory / self.file_name(number, episode.name)).open("xb") as file:
                     write_npz(file, arrays)
         return Path(out)
@@ -60,12 +63,17 @@ class NpzLog(ArrayLog):
 
 
 def read_npz(file: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of a file, without unpickling anything. Raises `LareError` if the file is damaged."""
+    """Read the arrays of a file, without unpickling anything. Raises `LareError` if the file is damaged, or holds Python objects."""
+    values, key = {}, ""
     try:
         with open_npz(file, MAX_EPISODE_BYTES) as arrays:
-            return {key: arrays[key] for key in arrays.files}
+            for key in arrays.files:
+                values[key] = arrays[key]
     except Exception as error:  # NumPy and zipfile may raise anything for an untrusted file
+        if "allow_pickle" in str(error):
+            raise LareError(f"{file}: {key} holds Python objects, which are not read: save it without {key}") from error
         raise LareError(f"{file} is not an .npz file, or damaged: {short_repr(error)}") from error
+    return values
 
 
 class ListLog(ArrayLog):
@@ -97,9 +105,15 @@ class ListLog(ArrayLog):
                     )
 
 
+def _without_objects(value: Any) -> np.ndarray:
+    """Return an array. Texts that are Python objects, as of pandas, become an array of texts."""
+    array = np.asarray(value)
+    return np.array(array.tolist()) if array.dtype.hasobject else array
+
+
 def _has_objects(value: Any) -> bool:
     try:
-        return np.asarray(value).dtype.hasobject
+        return _without_objects(value).dtype.hasobject
     except (TypeError, ValueError, RuntimeError):  # unequal lengths; objects that do not convert
         return True
 

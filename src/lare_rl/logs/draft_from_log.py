@@ -38,6 +38,8 @@ def draft_log_task(source: Any) -> Draft:
 def _first_line(layout: SpaceLayout, key: str) -> str:
     """Return the first line of the text of a key: the number of entries, and what they are."""
     n_entries = count_entries(layout.size)
+    if layout.kind == "choices" and len(layout.choices) > 1:
+        return f"{n_entries}: one-hot rows of {', '.join(map(str, layout.choices))} options, one behind the other."
     if layout.kind == "choices":
         return f"{n_entries}, all 0 but one: the {'action that is taken' if key == 'action' else 'state'}."
     if layout.kind == "dict":

@@ -86,6 +86,11 @@ def infer_layout(name: str, values: Mapping[str, Any], role: TaskSpec | None) ->
             layouts[kind] = SpaceLayout(kind="choices", choices=(sizes[kind],), first=(0,))
         else:
             layouts[kind] = SpaceLayout(kind="numbers", shape=array.shape[1:])
+            if array.size and kind in sizes and layouts[kind].size != sizes[kind]:
+                raise LareError(
+                    f"{name}: {kind}s have rows of {layouts[kind].size} numbers, and the task has {kind}_size = {sizes[kind]}; choices "
+                    "must be whole numbers from 0, of the shape (T,)"
+                )
     max_episode_steps = None if role is None else role.max_episode_steps
     return LogLayout(**layouts, max_episode_steps=max_episode_steps, has_groups="group" in values)
 

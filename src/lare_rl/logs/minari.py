@@ -68,7 +68,9 @@ class MinariLog(Log):
             if "paid" in infos:
                 values["paid"] = np.asarray(infos["paid"])[1:]
             if self.group_key in infos:
-                values["group"] = np.atleast_1d(np.asarray(infos[self.group_key], object))[-1:]
+                group = np.atleast_1d(np.asarray(infos[self.group_key], object))[-1]
+                text = group.decode(errors="replace") if isinstance(group, bytes) else group  # HDF5 has bytes
+                values["group"] = np.array([text], object)
             reset = {key: metadata.get(key) for key in ("seed", "options")}
             yield name, values, {**values, **reset, "infos": infos}
 

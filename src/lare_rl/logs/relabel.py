@@ -161,6 +161,11 @@ def relabel(
     task = None if task is None else resolve_task(task, playable=False)
     log = open_log(source, task)
     log.check_output(out, overwrite)
+    if task is not None and task.group is not None and not log.layout.has_groups:
+        raise LareError(
+            f"task {task.name!r} has group = {task.group!r}, and the first episode of {log.name} has no group (an array or a column "
+            f"`group`; in Minari, infos[{task.group!r}]): add it, or remove the key from the task file"
+        )
     if method is not None and METHODS.find(method).reward is Reward.UNIFORM:
         raise LareError(
             f"{method} gives all steps of an episode the same reward, and needs no relabelling: compute it from the return"
@@ -237,6 +242,11 @@ def _fit(
     for episode in log.episodes():
         if episode.complete and not next(is_held_out):
             n_fitted += 1
+            if (episode.group is not None) != log.layout.has_groups:
+                problem = "no group" if log.layout.has_groups else "a group"
+                raise LareError(
+                    f"{episode.name} has {problem}, unlike the first episode: give all episodes a group, or none"
+                )
             try:
                 reward = episode.reward[-1] if episode.is_score else episode.reward
                 steps = episode.observation, episode.action, episode.next_observation, reward
@@ -286,8 +296,7 @@ def _compute_rewards(
             if episode.complete and next(is_held_out):
                 counts.returns.append(float(episode.reward.sum()))
                 level = None if episode.group is None else credit.group_names.get(episode.group)
-                unpaid = credit.step_rewards.unpaid_return(level, payments.length)
-                counts.predictions.append(float(predicted.sum()) + unpaid)
+                counts.predictions.append(credit.step_rewards.predicted_return(predicted, level, payments.length))
             if episode.complete and credit.config.spec.is_exact:
                 residual = np.add.reduceat(episode.reward, payments.end - payments.n_since_last) - predicted
                 r_hat = make_exact(r_hat, residual, payments, credit.config.settings)

@@ -73,7 +73,10 @@ class TableLog(Log):
         pieces = (piece for batch in batches for piece in _split_episodes(self.name, batch))
         for episode, group in itertools.groupby(pieces, key=itemgetter(0)):
             if episode in finished:
-                raise LareError(f"{self.name}, episode {episode} comes twice: sort the rows by episode")
+                raise LareError(
+                    f"{self.name}, episode {episode} comes twice: sort the rows by episode or, if each file counts from 0, number "
+                    "the episodes across files"
+                )
             finished.add(episode)
             yield episode, pa.Table.from_batches([rows for _, rows in group])
 

@@ -100,7 +100,9 @@ def make_stub(name: str, environment: str, agents: Iterable[Any] = (), **keys: A
             name=file_name(name), environment=environment, observation_size=1, action_size=1, **texts, **keys
         )
 
-    kinds = list(dict.fromkeys(map(agent_kind, agents)))
+    names = list(map(str, agents))
+    # Names that are numbers say nothing about kinds.
+    kinds = [] if all(name.isdigit() for name in names) else list(dict.fromkeys(map(agent_kind, names)))
     teams = [stub(kind, team=kind, agents=_name_patterns(kind)) for kind in kinds if len(kinds) > 1]
     return stub(name, teams=teams, **keys)
 

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
+from lare_rl.errors import check_count
+
 __all__ = ["PAID_AT_END", "PaymentRule", "is_paid"]
 
 
@@ -16,6 +18,11 @@ class PaymentRule:
     """Every reward that is not 0 is a payment."""
     window: int | None = None
     """A payment is for this number of last steps of its episode. None means all steps since the last payment."""
+
+    def __post_init__(self) -> None:
+        for name in ("period", "window"):
+            if getattr(self, name) is not None:
+                check_count(name, getattr(self, name))
 
     @property
     def only_at_end(self) -> bool:

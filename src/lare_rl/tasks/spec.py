@@ -156,6 +156,8 @@ class TaskSpec(CheckedModel):
     @field_validator("measures")
     @classmethod
     def _check_measures(cls, measures: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(measures)) < len(measures):
+            raise ValueError("the same key is listed twice.")
         if taken := sorted(OWN_METRICS.intersection(measures)):
             raise ValueError(f"{taken[0]!r} is a metric of every evaluation. Give the key of info another name.")
         return measures

@@ -38,7 +38,7 @@ class FeatureEffect(NamedTuple):
 
     name: str
     unit: float
-    """The mean of the feature in the turns where it is not 0."""
+    """The mean size of the feature in the turns where it is not 0."""
     frequency: float
     """The share of the turns where it is not 0."""
     first: float
@@ -195,7 +195,7 @@ def _describe_effects(table: TurnTable, prefixes: Prefixes, fit: PrefixFit) -> t
     for i, name in enumerate(table.names):
         column = table.features[:, i]
         is_nonzero = column != 0
-        unit = float(column[is_nonzero].mean()) if is_nonzero.any() else 1.0
+        unit = float(np.abs(column[is_nonzero]).mean()) if is_nonzero.any() else 1.0
         size = np.where(prefixes.kind == HAPPENED, 1.0, unit) * (prefixes.feature_index == i)
         numbers = {}
         for effect, kinds in EFFECT_KINDS.items():

@@ -63,6 +63,7 @@ def tabulate(rollouts: Sequence[Rollout]) -> TurnTable:
     names = tuple(sorted(name for name, _ in counts.most_common(MAX_FEATURES)))
     columns = {name: column for column, name in enumerate(names)}
     length = np.array([len(rollout.turns) for rollout in rollouts])
+    group_numbers = {group: i for i, group in enumerate(sorted({rollout.group for rollout in rollouts}))}
     features = np.zeros((length.sum(), len(names)))
     for row, turn in enumerate(turn for rollout in rollouts for turn in rollout.turns):
         for name in turn.keys() & columns.keys():
@@ -72,7 +73,7 @@ def tabulate(rollouts: Sequence[Rollout]) -> TurnTable:
         features=features,
         length=length,
         outcome=np.array([rollout.outcome for rollout in rollouts], float),
-        group=np.unique([rollout.group for rollout in rollouts], return_inverse=True)[1],
+        group=np.array([group_numbers[rollout.group] for rollout in rollouts]),
         truncated=np.array([rollout.truncated for rollout in rollouts], bool),
     )
 

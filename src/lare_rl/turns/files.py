@@ -15,8 +15,8 @@ __all__ = ["MAX_LINE_BYTES", "read_rollout_file", "read_tool_file", "write_credi
 
 MAX_LINE_BYTES = 64 << 20
 """The largest size of a rollout."""
-DECIMALS = 6
-"""Decimal places of the numbers that are written."""
+DIGITS = 6
+"""Digits of the numbers that are written."""
 
 
 def read_rollout_file(path: Path) -> list[dict[str, Any]]:
@@ -68,7 +68,7 @@ def write_credit_file(path: Path, rollouts: list[dict[str, Any]], credit: Credit
     lines = []
     for k, rollout in enumerate(rollouts):
         arrays = {name: getattr(credit, name)[k] for name in ("advantage", "progress", "deviation", "value")}
-        numbers = {name: [round(float(number), DECIMALS) for number in array] for name, array in arrays.items()}
+        numbers = {name: [float(f"{number:.{DIGITS}g}") for number in array] for name, array in arrays.items()}
         lines.append(json.dumps({**rollout, "credit": {**numbers, "lambda": credit.lambda_}}, ensure_ascii=False))
     # A text of a rollout may have half of a surrogate pair. UTF-8 has no bytes for it, but JSON has the escape that is written here.
     write_bytes(path, "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace"))

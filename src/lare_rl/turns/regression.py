@@ -95,7 +95,8 @@ def sum_up(
     n_groups, total = int(group.max()) + 1, weight.sum()
     x_mean, y_mean = weight @ x / total, weight @ y / total
     x_centred, y_centred = x - x_mean, y - y_mean
-    x_centred = np.where(varies(weight @ x_centred**2 / total, x_mean**2), x_centred, 0)
+    size = np.maximum(np.abs(x).max(axis=0, initial=0), 1e-300)  # features of turns are not standardised
+    x_centred = np.where(varies(weight @ (x_centred / size) ** 2 / total, (x_mean / size) ** 2), x_centred, 0)
     y_std = unit or np.sqrt(weight @ y_centred**2 / total)
     if not y_std > 1e-9 * np.abs(y).max(initial=0):
         y_std, y_centred = 0.0, np.zeros_like(y)

@@ -12,16 +12,20 @@ the slopes of V.
 """
 
 import itertools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from lare_rl.turns.features import TurnTable
 from lare_rl.turns.logistic import fit_logistic, logistic
 from lare_rl.turns.regression import PrefixFit, fit_linear
 
 __all__ = ["advantages", "changes", "fit_prefixes", "held_out_values", "posterior_stds", "values"]
+
+MAX_NUMBERS = 4_000_000
+"""The size of the largest array of covariances."""
 
 
 def fit_prefixes(table: TurnTable, x: Float[np.ndarray, "turns features"], *, is_logistic: bool = False) -> PrefixFit:
@@ -100,6 +104,13 @@ def _rows(table: TurnTable, x: Float[np.ndarray, "turns features"], fit: PrefixF
     return np.column_stack([x - fit.x_mean, np.ones(len(x))]) - fit.group_row[table.group][table.rollout_index]
 
 
+def _equal_lengths(length: Int[np.ndarray, " rollouts"]) -> Iterator[tuple[int, Int[np.ndarray, " some"]]]:
+    """Yield rollouts of equal length, at most so many that a matrix for each of them has `MAX_NUMBERS` numbers in all."""
+    for size in np.unique(length).tolist():
+        rollouts = np.flatnonzero(length == size)
+        yield from ((size, part) for part in np.array_split(rollouts, -(-len(rollouts) * size**2 // MAX_NUMBERS)))
+
+
 def held_out_values(
     table: TurnTable, x: Float[np.ndarray, "turns features"], fit: PrefixFit
 ) -> Float[np.ndarray, " turns"]:
@@ -111,8 +122,7 @@ def held_out_values(
     predictions = _predict(table, x, fit)
     rows = _rows(table, x, fit) @ fit.root.T
     eta = np.empty_like(predictions.eta)
-    for size in np.unique(table.length):
-        rollouts = np.flatnonzero(table.length == size)
+    for size, rollouts in _equal_lengths(table.length):
         index = table.first[rollouts][:, None] + np.arange(size)
         block = rows[index]
         covariance = block @ block.swapaxes(1, 2) + 1 / fit.group_precision[table.group[rollouts]][:, None, None]

@@ -1,6 +1,7 @@
 """Threads of linear algebra (BLAS and LAPACK), without JAX."""
 
 import contextlib
+import sys
 import threading
 from collections.abc import Iterator
 from functools import cache
@@ -31,7 +32,8 @@ def one_blas_thread() -> Iterator[None]:
     """
     with _LIMIT.lock:
         if not _LIMIT.n_users:
-            _LIMIT.opened.enter_context(_libraries().limit(limits=1, user_api="blas"))
+            libraries = _libraries("scipy.linalg" in sys.modules)
+            _LIMIT.opened.enter_context(libraries.limit(limits=1, user_api="blas"))
         _LIMIT.n_users += 1
     try:
         yield
@@ -48,6 +50,6 @@ def load_linear_algebra() -> None:
 
 
 @cache
-def _libraries() -> ThreadpoolController:
-    load_linear_algebra()
+def _libraries(has_scipy: bool) -> ThreadpoolController:
+    """Find the libraries that are loaded now. They are others once SciPy has its own (`has_scipy`)."""
     return ThreadpoolController()

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import jax
 
 from lare_rl.errors import LareError
-from lare_rl.util.blas import one_blas_thread
+from lare_rl.util.blas import load_linear_algebra, one_blas_thread
 
 __all__ = ["float64", "require_float32"]
 
@@ -14,6 +14,7 @@ __all__ = ["float64", "require_float32"]
 @contextlib.contextmanager
 def float64() -> Iterator[None]:
     """Let JAX calculate and trace in float64, and linear algebra use one thread. Wait for results before the block ends."""
+    load_linear_algebra()
     with jax.enable_x64(True), one_blas_thread():
         yield
 
