@@ -109,7 +109,10 @@ def test_real_environments(environment, arguments, sizes, n_episodes, monkeypatc
 
 def test_teams_of_a_task():
     patterns = {"good": "agent_*", "bad": "adversary_*"}
-    teams = tuple(make_task(ADVERSARY, 13, 5, team=name, agents=(agents,)) for name, agents in patterns.items())
+    teams = tuple(
+        make_task(ADVERSARY, 13, 5, team=name, agents=(agents,)).model_copy(update={"name": name})
+        for name, agents in patterns.items()
+    )
     host = make(make_task(ADVERSARY, 13, 5, teams=teams))
     assert host.spec.teams == (Team("good", 0, 2), Team("bad", 2, 3))
     first = host.reset(0)

@@ -309,11 +309,11 @@ def target_scale(state: ClosedForm, *, is_average: Bool[Array, ""], index: Int[A
     statistics, basis = to_float64(state.sufficient_statistics), state.decoder.basis
     mean, start = statistics.mean, state.start_value[index]
     moments = statistics.products / jnp.maximum(statistics.n_steps, 1) + jnp.outer(mean, mean)
-    of_average = moments[-1, -1] - 2 * start * mean[-1] + start**2
-    of_sum, column = moments[-2, -2], basis.n_features  # 1/T
+    average_square = moments[-1, -1] - 2 * start * mean[-1] + start**2
+    sum_square, column = moments[-2, -2], basis.n_features  # 1/T
     if basis.start_value:
-        of_sum = of_sum - 2 * start * moments[column, -2] + start**2 * moments[column, column]
-    return jnp.sqrt(jnp.maximum(jnp.where(is_average, of_average, of_sum), 0))
+        sum_square = sum_square - 2 * start * moments[column, -2] + start**2 * moments[column, column]
+    return jnp.sqrt(jnp.maximum(jnp.where(is_average, average_square, sum_square), 0))
 
 
 def reward_std(

@@ -244,6 +244,10 @@ def _check_teams(task: TaskSpec, names: Sequence[str]) -> None:
         for key in SHARED_KEYS:  # training reads only the task's keys, verification only the team's
             value = getattr(task, key)
             _expect(role, key, value, f"{value!r} in {task.name!r}. Use the same value in both.")
+        for key in ("score", "measures"):  # of the task alone
+            if getattr(role, key):
+                value = getattr(task, key)
+                _expect(role, key, value, f"{value!r} in {task.name!r}. Set it there.")
     if task.teams:
         if [role.team for role in task.teams] != names:
             raise LareError(f"the teams of {env} must be {', '.join(names)}, in this order")

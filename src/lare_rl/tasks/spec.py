@@ -49,11 +49,9 @@ SHARED_KEYS = (
     "max_episode_steps",
     "credit_scope",
     "scored_observation",
-    "score",
     "payments",
     "paid_for",
     "group",
-    "measures",
     "processes",
     "timeout",
 )
@@ -158,8 +156,8 @@ class TaskSpec(CheckedModel):
     def _check_measures(cls, measures: tuple[str, ...]) -> tuple[str, ...]:
         if len(set(measures)) < len(measures):
             raise ValueError("the same key is listed twice.")
-        if taken := sorted(OWN_METRICS.intersection(measures)):
-            raise ValueError(f"{taken[0]!r} is a metric of every evaluation. Give the key of info another name.")
+        if reserved := sorted(OWN_METRICS.intersection(measures)):
+            raise ValueError(f"{reserved[0]!r} is a metric of every evaluation. Give the key of info another name.")
         return measures
 
     @model_validator(mode="after")

@@ -108,7 +108,7 @@ def _equal_lengths(length: Int[np.ndarray, " rollouts"]) -> Iterator[tuple[int, 
     """Yield rollouts of equal length, at most so many that a matrix for each of them has `MAX_NUMBERS` numbers in all."""
     for size in np.unique(length).tolist():
         rollouts = np.flatnonzero(length == size)
-        yield from ((size, part) for part in np.array_split(rollouts, -(-len(rollouts) * size**2 // MAX_NUMBERS)))
+        yield from ((size, chunk) for chunk in np.array_split(rollouts, -(-len(rollouts) * size**2 // MAX_NUMBERS)))
 
 
 def held_out_values(
