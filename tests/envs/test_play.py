@@ -11,6 +11,7 @@ from lare_rl.envs.env_errors import EnvOutputError
 from lare_rl.envs.families import register_family
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.envs.play import Episode, phi_inputs, play_episodes, play_roles, play_steps, sample_action
+from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
@@ -215,3 +216,18 @@ def test_random_actions_are_uniform():
     shares, span = np.array([0, 0.25, 0.75, 1]), high - low
     error = np.abs(np.quantile(actions, shares, axis=0) - (low + shares[:, None, None] * span))
     assert (error <= 0.05 * span).all()
+
+
+class Halving(Hunt):
+    """It changes its action in place."""
+
+    def step(self, action):
+        action *= 0.5
+        return super().step(action)
+
+
+def test_environment_that_changes_its_action():
+    envs, action = LocalVecEnv([Halving]), np.ones((1, 3, 2), np.float32)
+    envs.reset(np.ones(1, bool), np.zeros(1, int))
+    envs.step(action)
+    assert (action == 1).all()

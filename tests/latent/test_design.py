@@ -191,3 +191,10 @@ def test_replies_survive_an_error(chase, error, status):
     with pytest.raises(type(error)) as raised:
         design(chase, model=scripted(error=error), candidates=3)
     assert raised.value is error
+
+
+def test_reply_that_is_no_text(chase):
+    """The replies before it were paid for."""
+    with pytest.raises(DesignError, match="must return a text") as raised:
+        design(chase, model=scripted(GOOD, None), candidates=2)
+    assert [exchange.replies for exchange in raised.value.recorder.exchanges] == [[GOOD]]

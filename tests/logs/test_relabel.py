@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import lare_rl
+from helpers.toy_envs import toy_spec
 from helpers.toy_logs import PHI, logged_episodes, read_directory
 from lare_rl import LareError
 from lare_rl.credit.decoder_settings import CreditSettings
@@ -328,3 +329,24 @@ def test_terminated_command_leaves_nothing(command, folder, tmp_path, monkeypatc
         signal.signal(signal.SIGTERM, handler)
     assert status == 128 + signal.SIGTERM
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_predictions_of_odds_are_those_of_the_assigner(tmp_path):
+    """The returns of binary scores are predicted by the odds, not by their straight line."""
+    episodes = list(logged_episodes(200, max_length=8))
+    sums = [episode.pop("rewards").sum() for episode in episodes]
+    for episode, total in zip(episodes, sums, strict=True):
+        episode["score"] = np.array(float(total > np.median(sums)))
+    result = relabel(episodes, tmp_path / "new", settings=CreditSettings(score="binary"), hold_out=0.3)
+    assert result.return_r2 > 0.8  # by a straight line: about 0.6
+
+
+def test_groups_of_the_task_and_the_log_agree(tmp_path):
+    episodes = list(logged_episodes(10))
+    task = toy_spec(environment="none", observation_size=2, action_size=1, group="level")
+    with pytest.raises(LareError, match="group = 'level'"):
+        relabel(episodes, tmp_path / "new", task=task)
+    for number, episode in enumerate(episodes):
+        episode |= {"group": "easy"} if number != 4 else {}
+    with pytest.raises(LareError, match="episode 4 has no group"):
+        relabel(episodes, tmp_path / "new", settings=SUM, hold_out=0.0)

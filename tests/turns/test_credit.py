@@ -32,6 +32,22 @@ def test_order_units_and_names_of_groups_do_not_matter(rollouts):
         np.testing.assert_allclose(100 * first.deviation[k], second.deviation[position], rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.parametrize("size", [1.0, 1e-6])
+def test_signed_and_small_numbers(size):
+    """A number of either sign decides the outcome."""
+    random = np.random.default_rng(0)
+    rollouts = []
+    for k in range(120):
+        delta = random.choice([-1.0, 1.0], size=4)
+        turns = [{"delta": size * value} for value in delta]
+        rollouts.append({"turns": turns, "outcome": float(delta.sum() + random.normal() > 0), "group": k // 6})
+    result = lare_rl.TurnCredit()(rollouts)
+    (effect,) = result.effects
+    assert effect.unit == pytest.approx(size)
+    assert effect.first > 0.05
+    assert result.gain > 0.1
+
+
 def test_an_event_that_matters_gets_the_credit(rollouts):
     result = lare_rl.TurnCredit()(rollouts)
     effects = {effect.name: effect for effect in result.effects}
