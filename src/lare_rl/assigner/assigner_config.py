@@ -124,7 +124,7 @@ def resolve_config(
     agents: int,
     **values: Any,
 ) -> AssignerConfig:
-    """Return the configuration for arguments of `CreditAssigner`. The task gives the values of those that are None.
+    """Return the configuration for arguments of `CreditAssigner`. If an argument is None, the task decides it.
 
     Raises:
         LareError: there is no such method or task, or the spaces are not those of the task.

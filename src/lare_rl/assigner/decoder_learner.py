@@ -200,8 +200,8 @@ class DecoderLearner:
         closed = decoder.closed_form
         if closed is None:
             return decoder
-        # Sums that are computed anew lack the episodes that are not stored: those that were overwritten, which may be forgotten, and all
-        # earlier ones after a load without episodes.
+        # New sums have only the stored episodes. Training may forget episodes that were overwritten. After a load without episodes, the old
+        # sums are all that is known of them.
         are_all_stored = len(self.store.episodes) == self.store.n_ended
         may_rebuild = are_all_stored or (self.config.forget and self.store.oldest_step > 0)
         if self.config.method.fit is not Fit.SIGNS and may_rebuild and compiled.is_stale(closed, decoder.statistics):

@@ -88,8 +88,11 @@ class GymnasiumEnv:
         assert isinstance(action_space, Discrete | Box)
         self._agent = Agent("agent", self.environment.observation_space, action_space, observes_mask=False)
         if isinstance(action_space, Box):
-            bounds = action_space.low[None], action_space.high[None]
-            fields: dict[str, Any] = {"low": bounds[0], "high": bounds[1], "package_dtype": integer_dtype(action_space)}
+            fields: dict[str, Any] = {
+                "low": action_space.low[None],
+                "high": action_space.high[None],
+                "package_dtype": integer_dtype(action_space),
+            }
         else:
             fields = {"first_choice": int(action_space.start)}
         self.spec = EnvSpec(

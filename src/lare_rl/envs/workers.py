@@ -149,13 +149,13 @@ class SubprocVecEnv(VecEnv):
         while busy := [worker for worker in self._workers if worker.is_busy]:
             if self.stop_requested():
                 stopped_at = min(stopped_at, time.monotonic())
-            limits = [self._latest_reply(worker, stopped_at) for worker in busy]
-            wait_s = min(POLL_S, max(0.0, min(limits) - time.monotonic()))
+            first_limit = min(self._latest_reply(worker, stopped_at) for worker in busy)
+            wait_s = min(POLL_S, max(0.0, first_limit - time.monotonic()))
             ready = wait([worker.connection for worker in busy], wait_s)
-            for worker, limit in zip(busy, limits, strict=True):
+            for worker in busy:
                 if worker.connection in ready:
                     replies.append((worker, worker.receive()))
-                elif time.monotonic() > max(limit, self._latest_reply(worker, stopped_at)):
+                elif time.monotonic() > self._latest_reply(worker, stopped_at):
                     seconds, advice = self.timeout, "if it needs longer, set timeout in the task file"
                     if stopped_at < math.inf:
                         seconds, advice = STOP_TIMEOUT_S, "the run was asked to stop, and cannot be saved"

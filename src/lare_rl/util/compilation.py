@@ -73,7 +73,7 @@ def _prepare_cache(variables: Mapping[str, str]) -> dict[str, str | float]:
 
 
 def _remove_incomplete_programs(directory: Path) -> None:
-    """Remove each program of which only one file exists, because a process was killed. JAX would fail whenever it reads it."""
+    """Remove programs with one file instead of two. A killed process leaves them, and JAX fails when it reads them."""
     with FileLock(directory / ".lockfile", timeout=_LOCK_TIMEOUT_S):  # JAX's own lock, so that no process is writing
         programs, times = (
             {file.name.removesuffix(suffix) for file in directory.glob(f"*{suffix}")}
