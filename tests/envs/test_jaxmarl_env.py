@@ -18,7 +18,7 @@ TAG = "jaxmarl/MPE_simple_tag_v3"
 
 
 def tag_team(name: str):
-    return family_task(TAG, 20, 5, agents=[f"{name}_*"], team=name)
+    return family_task(TAG, 20, 5, name=name, agents=[f"{name}_*"], team=name)
 
 
 def test_time_limit_truncates_and_keeps_the_last_observation():

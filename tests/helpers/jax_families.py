@@ -22,8 +22,8 @@ def require_family(environment: str) -> None:
 
 
 def family_task(environment: str, observation_size: int = 1, action_size: int = 1, **changes) -> TaskSpec:
-    sizes = {"observation_size": observation_size, "action_size": action_size}
-    return toy_spec(name="Family", environment=environment, **sizes, **changes)
+    values = {"name": "Family", "observation_size": observation_size, "action_size": action_size}
+    return toy_spec(environment=environment, **(values | changes))
 
 
 def play(env: JaxEnv, n_envs: int, n_steps: int) -> tuple[Timestep, np.ndarray, Timestep]:
