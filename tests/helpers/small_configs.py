@@ -11,8 +11,8 @@ from lare_rl.algorithms.qmix import QMIXSettings
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.algorithms.td3 import TD3Settings
 from lare_rl.config.train_config import TrainConfig
-from lare_rl.credit.closed_form import LinearDecoder
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.linear_decoder import LinearDecoder
 from lare_rl.credit.methods import METHODS
 from lare_rl.data import replay
 from lare_rl.data.replay import STEP_COLUMNS

@@ -1,10 +1,10 @@
 """A decoder that is fitted in closed form to all episodes so far. New episodes only add to its sufficient statistics.
 
-    r_hat = b + w . f(u),    u = (x - mean) / std
+    r_hat = b + w . f(u)        (`linear_decoder.py`)
 
-x are a step's inputs, and f the features of `basis.py`. If the score is an average, the left side is T r_hat. w and b are computed
-from sums over episodes (`evidence.py`), without gradient descent. Episode k has T_k steps, the mean features m_k, the return R_k, and
-y_k = R_k / T_k, or R_k if the score is an average. In LaRe without a reward model (`lare-signs`), w are signs instead:
+w and b are computed from sums over episodes (`evidence.py`), without gradient descent. Episode k has T_k steps, the mean
+features m_k, the return R_k, and y_k = R_k / T_k, or R_k if the score is an average. In LaRe without a reward model
+(`lare-signs`), w are signs instead:
 
     w = argmin sum_k T_k (R_k/T_k - w . m_k)^2  over  w in {-1, 1}^d,    b = 0,    f(u) = x
 
@@ -35,32 +35,28 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int
 
-from lare_rl.credit import evidence, logistic, relevance
-from lare_rl.credit.basis import Basis, expand, expand_history
-from lare_rl.credit.decoder_network import DecoderOutput
+from lare_rl.credit import evidence, linear_decoder, logistic, relevance
+from lare_rl.credit.basis import Basis
 from lare_rl.credit.evidence import SufficientStatistics
+from lare_rl.credit.linear_decoder import LinearDecoder
 from lare_rl.credit.logistic import LogOddsFit
 from lare_rl.credit.precisions import Posterior
 from lare_rl.credit.score_type import ScoreType
-from lare_rl.credit.spec import CreditSpec
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.normalise import RunningMeanStd, running_std
 
 __all__ = [
     "ClosedForm",
-    "LinearDecoder",
     "drop_start_value",
     "fit",
     "fit_signs",
     "init",
-    "init_linear_decoder",
     "is_due",
     "is_stale",
     "reset_statistics",
     "reward_std",
-    "select_score_type",
     "split_double",
     "target_scale",
     "to_float64",
@@ -74,34 +70,6 @@ FIT_GROWTH = 1.05
 """The decoder is fitted again when the number of episodes has grown by this factor."""
 MAX_EVIDENCE_ROUNDS = 20
 """The maximum number of rounds of the evidence's fixed point, from each of its starts."""
-
-
-class LinearDecoder(eqx.Module):
-    """r_hat = b + w . f(u), or T r_hat if the score is an average."""
-
-    basis: Basis = eqx.field(static=True)
-    mean: Float[Array, " inputs"]
-    std: Float[Array, " inputs"]
-    """0 for an input that has never varied. Such an input is ignored."""
-    weight: Float[Array, "*score_types features"]
-    bias: Float[Array, "*score_types"]
-
-    def __call__(self, rows: Float[Array, "rows *agents inputs"], key: object = None) -> DecoderOutput:
-        return DecoderOutput(self.features(rows) @ self.weight + self.bias)
-
-    def features(self, rows: Float[Array, "*batch inputs"]) -> Float[Array, "*batch features"]:
-        """Return f(u)."""
-        size, n_tracked = self.basis.n_standardised, self.basis.n_tracked
-        varies = self.std > 0
-        std = jnp.where(varies, self.std, 1)
-        u = jnp.where(varies, (rows[..., :size] - self.mean) / std, 0)
-        features = expand(self.basis, u)
-        if not n_tracked:
-            return features
-        tracked = slice(n_tracked)
-        history = rows[..., size:].reshape(*rows.shape[:-1], 3, n_tracked)
-        history = jnp.where(varies[tracked], (history - self.mean[tracked]) / std[tracked], 0)
-        return jnp.concatenate([features, expand_history(self.basis, u[..., tracked], history)], axis=-1)
 
 
 class ClosedForm(NamedTuple):
@@ -136,13 +104,7 @@ def init(basis: Basis, score_types: tuple[int, ...]) -> ClosedForm:
         lambda leaf: jnp.tile(leaf, (n_score_types - has_log_odds, *[1] * leaf.ndim)), posteriors
     )
     return ClosedForm(
-        decoder=LinearDecoder(
-            basis=basis,
-            mean=jnp.zeros(basis.n_standardised),
-            std=jnp.ones(basis.n_standardised),
-            weight=jnp.zeros((n_score_types, basis.n_features)),
-            bias=jnp.zeros(n_score_types),
-        ),
+        decoder=linear_decoder.init(basis, n_score_types),
         sufficient_statistics=split_double(evidence.empty_statistics(basis.n_columns)),
         n_steps=jnp.zeros(()),
         n_fitted=jnp.zeros(()),
@@ -363,13 +325,3 @@ def _set_weights(state: ClosedForm, weights: _Weights) -> ClosedForm:
         intercept=columns[:, basis.n_columns - basis.n_levels :],
         start_value=start_value,
     )
-
-
-def select_score_type(decoder: LinearDecoder, index: Int[Array, ""] | int) -> LinearDecoder:
-    """Return the decoder of one score type, from the decoders of all fitted score types. `index` is its position among them."""
-    return eqx.tree_at(lambda d: (d.weight, d.bias), decoder, (decoder.weight[index], decoder.bias[index]))
-
-
-def init_linear_decoder(key: PRNGKeyArray, spec: CreditSpec) -> LinearDecoder:
-    """Return the decoder before the first fit. `key` is not used."""
-    return select_score_type(init(spec.basis, (ScoreType.SUM,)).decoder, 0)

@@ -86,7 +86,7 @@ for _decoder in (
     Decoder("rudder", "lare_rl.credit.rudder:RUDDER", frozenset({"hidden"}), single_agent_only=True),
     Decoder("grd", "lare_rl.credit.grd:GRD", frozenset({"hidden", "sparsity"}), single_agent_only=True),
     Decoder("rbt", "lare_rl.credit.rbt:RBT", frozenset({"hidden"}), single_agent_only=True, longest_segment=RBT_STEPS),
-    Decoder("linear", "lare_rl.credit.closed_form:init_linear_decoder", closed_form=True),
-    Decoder("additive", "lare_rl.credit.closed_form:init_linear_decoder", closed_form=True, extended_basis=True),
+    Decoder("linear", "lare_rl.credit.linear_decoder:init_from_spec", closed_form=True),
+    Decoder("additive", "lare_rl.credit.linear_decoder:init_from_spec", closed_form=True, extended_basis=True),
 ):
     register_decoder(_decoder)

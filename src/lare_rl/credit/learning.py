@@ -17,9 +17,10 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from lare_rl.credit import closed_form, decoder_state, evidence, logistic
-from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
+from lare_rl.credit import closed_form, decoder_state, evidence, linear_decoder, logistic
+from lare_rl.credit.closed_form import ClosedForm
 from lare_rl.credit.decoder_state import CreditBatch, DecoderState
+from lare_rl.credit.linear_decoder import LinearDecoder
 from lare_rl.credit.methods import Fit
 from lare_rl.credit.prequential import Predictions, add_predictions
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate, compare_score_types, is_better, score_type_errors
@@ -193,7 +194,7 @@ def fit_closed_form(state: DecoderState, spec: CreditSpec, *, batched: bool = Fa
         state = _choose_score_type(state, state.score_type_predictions, score_types)
     index = decoder_state.score_type_index(state, len(score_types))
     if not spec.method.uses_gradient:
-        return state._replace(network=closed_form.select_score_type(closed.decoder, index))
+        return state._replace(network=linear_decoder.select_score_type(closed.decoder, index))
     scale = closed_form.target_scale(closed, is_average=state.is_average, index=index)
     return state._replace(target_scale=jnp.where(closed.start_value[index] != 0, scale, 0).astype(jnp.float32))
 
