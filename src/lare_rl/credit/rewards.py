@@ -17,9 +17,11 @@ Batches have an axis of agents, of length 1 for a single agent. For credit to wh
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import decoder_state
+from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.methods import Reward
 from lare_rl.credit.spec import CreditSpec
@@ -27,7 +29,9 @@ from lare_rl.credit.tar2 import pay_shares
 from lare_rl.envs.interface import alive_mean
 from lare_rl.nn.normalise import Scale, min_max_scale, root_mean_square
 
-__all__ = ["StepBatch", "proxy_rewards", "scale_and_mask", "training_rewards"]
+__all__ = ["StepBatch", "correction", "proxy_rewards", "scale_and_mask", "training_rewards"]
+
+_AnyArray = Array | np.ndarray
 
 
 class StepBatch(NamedTuple):
@@ -72,11 +76,20 @@ def training_rewards(state: DecoderState, steps: StepBatch, spec: CreditSpec) ->
     alive = steps.alive
     r_hat = jnp.broadcast_to(proxy_rewards(state, steps, spec), alive.shape)
     if steps.residual is not None:
-        pays_last = spec.settings.exact == "last"
-        r_hat = r_hat + (steps.residual * steps.last if pays_last else steps.residual / steps.length)[..., None]
+        r_hat = r_hat + correction(steps.residual, steps.last, steps.length, spec.settings)[..., None]
     if spec.method.shared:
         r_hat = jnp.broadcast_to(alive_mean(r_hat, alive)[..., None], alive.shape)
     return scale_and_mask(r_hat, state.scale, alive, scale_rewards=spec.scale_rewards)
+
+
+def correction(
+    residual: Float[_AnyArray, "*batch"],
+    last: Bool[_AnyArray, "*batch"],
+    length: Int[_AnyArray, "*batch"],
+    settings: CreditSettings,
+) -> Float[_AnyArray, "*batch"]:
+    """Return what `exact` adds to the reward of each step: the residual of its payment at the last step, or spread over all."""
+    return residual * last if settings.exact == "last" else residual / length
 
 
 def scale_and_mask(

@@ -47,6 +47,10 @@ class EpisodeSample(NamedTuple):
     level: Int[Array, "*batch"] | None = None
     """The level of each. None without levels."""
 
+    def steps(self, step: Int[Array, "*batch steps"]) -> Index:
+        """Return the steps with these numbers, which count from 0 in each episode."""
+        return Index(jnp.broadcast_to(self.first.env[..., None], step.shape), self.first.number[..., None] + step)
+
 
 class CreditSample(NamedTuple):
     """The steps that one update of a decoder reads, and their episodes."""
@@ -165,11 +169,8 @@ def _locate(counts: Int[Array, " envs"], position: Int[Array, "*batch"]) -> Inde
 def _credit_sample(episodes: EpisodeSample, layout: Layout) -> CreditSample:
     """Return the sample with this layout, which has the same number of rows for each episode."""
     lead = episodes.length.shape[:-1]
-    env = jnp.broadcast_to(episodes.first.env[..., None], layout.step.shape)
-    number = episodes.first.number[..., None] + layout.step
-    return CreditSample(
-        Index(env.reshape(*lead, -1), number.reshape(*lead, -1)), layout.slot.reshape(*lead, -1), episodes
-    )
+    steps, slot = jax.tree.map(lambda rows: rows.reshape(*lead, -1), (episodes.steps(layout.step), layout.slot))
+    return CreditSample(steps, slot, episodes)
 
 
 def _pack(episodes: EpisodeSample, rows: int) -> CreditSample:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.rewards import correction
 from lare_rl.logs.episode import LoggedEpisode
 from lare_rl.tasks.payments import PaymentRule, is_paid
 
@@ -63,5 +64,4 @@ def make_exact(
 ) -> Float[np.ndarray, " steps"]:
     """Return proxy rewards to which the residual of each payment is added, at its last step, or spread over its steps."""
     residual, last = np.repeat(residual, payments.n_since_last), np.isin(np.arange(len(r_hat)), payments.end - 1)
-    added = residual * last if settings.exact == "last" else residual / payments.step_length
-    return (r_hat + added).astype(r_hat.dtype)
+    return (r_hat + correction(residual, last, payments.step_length, settings)).astype(r_hat.dtype)

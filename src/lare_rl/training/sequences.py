@@ -17,7 +17,7 @@ from lare_rl.algorithms.registry import SequenceSettings
 from lare_rl.config.train_config import TrainConfig
 from lare_rl.data import replay
 from lare_rl.data.layouts import lay_out_padded
-from lare_rl.data.replay import Index, Replay
+from lare_rl.data.replay import Replay
 from lare_rl.data.sampling import EpisodeSample, sample_distinct_episodes
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import team_mean
@@ -179,9 +179,7 @@ def _sequences(
     config: TrainConfig,
 ) -> Sequences:
     """Return episodes with the method's rewards. Each is padded to `n_steps` steps by copies of its last step."""
-    step = lay_out_padded(episodes.length, n_steps).step
-    env = jnp.broadcast_to(episodes.first.env[:, None], step.shape)
-    steps = replay.read(buffer, Index(env, episodes.first.number[:, None] + step))
+    steps = replay.read(buffer, episodes.steps(lay_out_padded(episodes.length, n_steps).step))
     mask = (jnp.arange(n_steps) < episodes.length[:, None]) * episodes.mask[:, None]
     reward = rewards(steps, decoders, config)
 
