@@ -156,25 +156,27 @@ def _resolve_layouts(task: TaskSpec | None, spaces: Mapping[str, Space | None]) 
     """Return the layouts of observations and actions. Raises `LareError` if there is no space and no task, or the two differ."""
     layouts = []
     for name, space in spaces.items():
-        if space is None and task is None:
-            raise LareError("CreditAssigner needs observation_space and action_space, or a task")
-        size = getattr(task, f"{name}_size", 0)
-        if space is None:
-            if name == "action" and task is not None and task.environment == NO_ENVIRONMENT:
-                raise LareError(
-                    f"task {task.name!r} has no environment: give action_space, a Gymnasium space or the length of an action"
-                )
-            env = load_env_spec(task) if name == "action" and task is not None else None
-            space = size
-            if env is not None and env.discrete:
-                space = gymnasium.spaces.Discrete(size, start=env.first_choice)
-        layout = make_layout(space, f"{name}_space")
-        if task is not None and layout.size != size:
+        layout = make_layout(_task_space(task, name) if space is None else space, f"{name}_space")
+        if task is not None and layout.size != (size := getattr(task, f"{name}_size")):
             raise LareError(
                 f"{name}_space has rows of {layout.size} numbers, but task {task.name!r} has {name}_size = {size}"
             )
         layouts.append(layout)
     return layouts
+
+
+def _task_space(task: TaskSpec | None, name: str) -> Space:
+    """Return the space of a task's observations or actions, or their length."""
+    if task is None:
+        raise LareError("CreditAssigner needs observation_space and action_space, or a task")
+    if name == "observation":
+        return task.observation_size
+    if task.environment == NO_ENVIRONMENT:
+        raise LareError(
+            f"task {task.name!r} has no environment: give action_space, a Gymnasium space or the length of an action"
+        )
+    env = load_env_spec(task)
+    return gymnasium.spaces.Discrete(task.action_size, start=env.first_choice) if env.discrete else task.action_size
 
 
 def check_config(config: AssignerConfig) -> None:
