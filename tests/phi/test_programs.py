@@ -43,7 +43,8 @@ SINGLE = ("float32", "single", "float16")
 
 
 def check_equal(result, expected, tolerance):
-    close = np.abs(result - expected) <= tolerance * (1 + np.abs(expected))
+    with np.errstate(invalid="ignore"):
+        close = np.abs(result - expected) <= tolerance * (1 + np.abs(expected))
     same = close | (np.isnan(result) & np.isnan(expected)) | (result == expected)
     assert same.all(), (result[~same][:3], expected[~same][:3])
 
@@ -87,6 +88,64 @@ def test_program_agrees_in_jax(index):
     result = np.asarray(jax.jit(transform(lambda inputs: evaluate(graph, inputs, jnp)["factors"]))(inputs))
     close = np.isclose(result, expected, rtol=2e-4, atol=2e-5, equal_nan=True)
     assert close.mean() > 0.995, (result[~close], expected[~close])  # a threshold may fall the other way
+
+
+STATEMENTS = [
+    # Copies and views.
+    "x = x.copy()\nm = x > 0\nv = x[m]\nx[m] = 0\nx[m] = v * 2\ny = x",
+    "x, y = x.copy(), x * 2\nm = x > 0\nx[m], y[m] = y[m], x[m]",
+    "x, y = x.copy(), 0\nfor p in (1, 2, 3):\n    term = x ** p\n    term *= 0.5\n    y = y + term",
+    "x = x.copy()\ny = +x\ny[:, 0] = 100\ny = x",
+    "x = x.copy()\ny = np.positive(x)\ny[:, 0] = 100\ny = x",
+    "x = x.copy()\ny = np.ascontiguousarray(x[:, :2])\ny[:] = 0\ny = x",
+    "x = x.copy()\ny = np.ascontiguousarray(x)\ny[:] = 0\ny = x",
+    "x = x.copy()\nv = x[:, 0].ravel()\nv += 100\ny = x",
+    "x = x.copy()\nv = x[:, :3].reshape(-1)\nv += 100\ny = x",
+    "x = x.copy()\nv = x.reshape(-1)\nv += 100\ny = x",
+    "x = x.copy()\nv = x.reshape(-1, 2, 3)[:, 0].ravel()\nv += 100\ny = x",
+    "x = x.copy()\nv = x.reshape(-1, 2, 3)[:, 0]\nv += 100\ny = x",
+    "y = x[:, 0:1].ravel()\ny *= 2",
+    # Numbers.
+    "y = np.where(x > x.min(axis=1, keepdims=True), np.arange(6), np.iinfo(np.int64).max).min(1)",
+    "y = np.polynomial.chebyshev.chebval(np.tanh(x[:, :1]), [0] * 30 + [1])",
+    "y = np.polynomial.laguerre.lagval(x, [1, 2, 3])",
+    "y = np.apply_along_axis(lambda r: np.sum(r[0]) * 1.0, 1, x)",
+    "y = np.linalg.norm(x.reshape(-1, 2, 3), ord=1, axis=(2, 1))",
+    "y = np.gradient(np.where(x > 1, np.inf, x), axis=1)",
+    "y = np.median(np.where(x > -9, np.inf, x), axis=1)",
+    "y = np.modf(np.where(x > 1, np.inf, x))[0]",
+    "y = np.vectorize(lambda v: v * 2, otypes=[int])(x)",
+    # Types, and objects.
+    "y = (type(3) is int) + 2 * ((x > 0).dtype == bool) + 4 * (np.arange(3).dtype == int) + 8 * (type(3) is float)",
+    "y = isinstance(np.array([1.0, 2.0]).max(), float) + 2 * (np.arange(3).dtype == 'int64') + 4 * (np.float32 == float)",
+    "from collections import namedtuple\nP = namedtuple('P', 'a b')\np = P(1, 2)\n"
+    "y = (p == P(1, 2)) + 2 * (p == (1, 2)) + 4 * isinstance(p, tuple) + 8 * (P(1, 3) > p) + 16 * len(p) + 64 * (2 in p) + 128 * bool(p)",
+    "from dataclasses import dataclass\n@dataclass\nclass P:\n    a: float\n    b: float\n"
+    "y = (P(1, 2) == P(1, 2)) + 2 * (P(1, 2) != P(1, 3)) + 4 * (P(1, 2) == (1, 2))",
+    "class A:\n    def __init__(self, n):\n        self.n = n\n    def __eq__(self, other):\n        return self.n == other.n\n"
+    "    def __lt__(self, other):\n        return self.n < other.n\n    def __len__(self):\n        return self.n\n"
+    "    def __contains__(self, k):\n        return k < self.n\na, b = A(0), A(2)\n"
+    "y = (a == A(0)) + 2 * (a != b) + 4 * (a < b) + 8 * (a > b) + 16 * (not a) + 32 * len(b) + 128 * (1 in b)",
+    "class A:\n    pass\na, b = A(), A()\ny = (a == a) + 2 * (a == b) + 4 * (a is a) + 8 * (a != 3) + 16 * bool(a)",
+    "class A:\n    v = 0\na, b = A(), A()\nit = iter([a, b])\nnext(it).v += 1\ny = a.v + 2 * b.v",
+    # Iterators.
+    "it = iter([1, 2, 3, 4])\nfor v in it:\n    if v == 2:\n        break\ny = sum(it)",
+    "it = iter([1, 2])\ny = {next(it): next(it)}[1]",
+    "y = dict(values={'k': 2})['values']['k'] + sum(itertools.repeat(0.5, 3)) + (3.0 in np.eye(2)) + (1.0 in np.eye(2))",
+    "y = {0: 5, 1: 7}[np.argmax(np.array([1, 2]))] if len(x) else 3",
+    "sum = x.sum(axis=1)\ny = sum.reshape(-1, 1)",
+]
+
+
+@pytest.mark.parametrize("statements", STATEMENTS)
+def test_statements_agree_with_numpy(statements):
+    """Each program computes y from x, the observation. The factor is a weighted sum of y."""
+    source = "import itertools\nimport numpy as np\n" + phi_source(
+        f"x = observation\n{statements}\ny = (y * np.ones_like(action) if np.ndim(y) == 0 else y).reshape(len(action), -1)\n"
+        "return [np.sum(y * np.arange(1, y.shape[1] + 1), axis=1, keepdims=True)]"
+    )
+    graph, inputs = read(source, 6, 3), dict(zip(("observation", "action"), random_inputs((6, 3), 9), strict=True))
+    check_equal(evaluate(graph, inputs)["factors"], execute_program(source, **inputs), 1e-5)
 
 
 @pytest.mark.parametrize("xp", [np, jnp])

@@ -100,8 +100,10 @@ def test_logs_of_sweep_are_skipped_and_other_paths_refused(make_run, tmp_path):
     assert find_run_directories([run.directory, log]) == [run.directory]
     with pytest.raises(LareError, match="no runs"):
         find_run_directories([log])
+    log = log.rename(log.with_name("b.log"))  # of a run that never began
+    assert find_run_directories([run.directory, log]) == [run.directory]
     with pytest.raises(LareError, match=r"b\.log is not a run"):
-        find_run_directories([run.directory, log.rename(log.with_name("b.log"))])
+        find_run_directories([log])
     (tmp_path / "results.csv").touch()
     for name, hint in (("nothing", False), ("results.csv", True)):
         with pytest.raises(LareError, match=f"{name} is not a run") as error:

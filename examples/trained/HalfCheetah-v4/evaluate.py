@@ -47,12 +47,20 @@ def compute_nodes(
             if node.op == "input":
                 values.append(xp.asarray(inputs[node.option], _dtypes(dtype)[node.kind]))
             elif node.op == "constant":
-                values.append(np.asarray(node.option, _dtypes(dtype)[node.kind]))
+                values.append(_cast_constant(node.option, _dtypes(dtype)[node.kind]))
             else:
                 values.append(compute(node, [values[i] for i in node.inputs], batch, xp, dtype))
             for i in () if keep else unused:
                 values[i] = None
     return values
+
+
+def _cast_constant(values: np.ndarray, dtype: Any) -> np.ndarray:
+    """Cast the numbers of a constant. An integer that is too large becomes the largest one, as in casts of fractions."""
+    if values.dtype == np.int64 and np.dtype(dtype) == np.int32:
+        limits = np.iinfo(np.int32)
+        values = np.clip(values, limits.min, limits.max)
+    return values.astype(dtype)
 
 
 def compute(node: Node, x: Sequence[Any], batch: tuple[int, ...], xp: Any = np, dtype: Any = np.float64) -> Any:

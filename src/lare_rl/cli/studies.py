@@ -51,7 +51,7 @@ def sweep(
         return
 
     def write_tables() -> None:
-        if rows := read_metric_rows(job.directory for job in jobs):
+        if rows := read_metric_rows([job.directory for job in jobs], print_progress):
             for path in write_table(rows, jobs[0].directory.parent.parent / "results"):
                 print_line(f"wrote {path}")
 

@@ -96,15 +96,18 @@ def print_messages(messages: Iterable[Message]) -> None:
 
 
 def print_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table, as wide as the terminal. Its first column is never wrapped."""
+    """Print a table, as wide as the terminal. No character of a cell is lost, whatever the width."""
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(*head, box=None, pad_edge=False)
-    table.columns[0].no_wrap = True
+    console = Console(width=None if sys.stdout.isatty() else TABLE_WIDTH, markup=False, emoji=False)
+    table = Table(box=None, pad_edge=False)
+    for i, title in enumerate(head):
+        is_first = i == 0  # it has names, which may be long: the numbers beside them need the rest of the line
+        table.add_column(title, overflow="fold", max_width=console.width // 3 if is_first else None)
     for row in rows:
         table.add_row(*map(sanitize, row))
-    Console(width=None if sys.stdout.isatty() else TABLE_WIDTH, markup=False).print(table)
+    console.print(table)
 
 
 def print_progress(text: str) -> None:

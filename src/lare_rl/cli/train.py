@@ -153,11 +153,17 @@ def _live_page(directory: Path, watch: bool) -> "list[Listener]":
 
     The page is written if `watch` is true, or if the directory already has one.
     """
-    if not watch and not directory.exists():
-        return []
-    from lare_rl.report.live_page import PAGE, LivePage
+    from lare_rl.runs.directory import LIVE_PAGE
 
-    page = directory / PAGE
+    page = directory / LIVE_PAGE
+    if not watch and not page.exists():
+        return []
+    try:
+        from lare_rl.report.live_page import LivePage
+    except LareError:
+        if watch:
+            raise
+        return []  # an old page is no reason to ask for the extra
     if watch:
         print_progress(f"to watch it: {page}")
-    return [LivePage(directory, browser=watch)] if watch or page.exists() else []
+    return [LivePage(directory, browser=watch)]

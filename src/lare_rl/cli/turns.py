@@ -95,6 +95,10 @@ def turn_phi(
     if not turns:
         raise LareError(f"{rollouts} has no message of an assistant")
     if model is None:
+        if out is not None or live != DEFAULT_LIVE:
+            raise LareError(
+                "--out and the options of a live model need --model NAME: without it, only the request is printed"
+            )
         print_messages(turn_request(goal, descriptions, choose_examples(turns)))
         return
     out = check_function_files(out)

@@ -2,10 +2,11 @@
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from lare_rl.errors import LareError
 from lare_rl.runs.config_file import CONFIG, read_config
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.util.files import write_atomically, write_bytes
@@ -16,13 +17,24 @@ KEYS = ("task", "run", "method", "algorithm", "scored_observation", "draw", "see
 """The first columns of the table."""
 
 
-def read_metric_rows(directories: Iterable[Path]) -> list[dict[str, Any]]:
-    """Read a row for each run, seed and evaluation."""
+def read_metric_rows(
+    directories: Iterable[Path], on_message: Callable[[str], object] | None = None
+) -> list[dict[str, Any]]:
+    """Read a row for each run, seed and evaluation.
+
+    A run that cannot be read is left out, and `on_message` is called with the reason. Without it, the error is raised.
+    """
     rows = []
     for directory in directories:
         if not (directory / CONFIG).is_file():
             continue
-        config = read_config(directory)
+        try:
+            config, lines = read_config(directory), read_metrics(directory)
+        except LareError as error:
+            if on_message is None:
+                raise
+            on_message(f"{directory} is not in the tables: {error}")
+            continue
         settings = config.settings
         keys = {
             "task": config.task.name,
@@ -32,7 +44,7 @@ def read_metric_rows(directories: Iterable[Path]) -> list[dict[str, Any]]:
             "scored_observation": settings.choose_scored_observation(config.task),
             "draw": settings.draw,
         }
-        rows += [keys | line for line in read_metrics(directory)]
+        rows += [keys | line for line in lines]
     return rows
 
 

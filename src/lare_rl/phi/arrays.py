@@ -44,9 +44,14 @@ class Array(_ArrayLike):
     read_only = False  # True for the inputs
 
     def __init__(
-        self, node: int, batch_axis: int | None, base: Array | None = None, positions: np.ndarray | None = None
+        self,
+        node: int,
+        batch_axis: int | None,
+        base: Array | None = None,
+        positions: np.ndarray | None = None,
+        two_rows: np.ndarray | None = None,
     ):
-        self._node, self.batch_axis, self.positions = node, batch_axis, positions
+        self._node, self.batch_axis, self.positions, self._two_rows = node, batch_axis, positions, two_rows
         self.base = self if base is None else base
 
     @property
@@ -144,17 +149,29 @@ class Array(_ArrayLike):
     @cached_property
     def source(self) -> Source:
         """The positions of its numbers in the base."""
-        return Source(all_positions(self.row_shape) if self.positions is None else self.positions, self.batch_axis)
+        if self.positions is not None:
+            return Source(self.positions, self.batch_axis, self._two_rows)
+        source = Source(all_positions(self.row_shape), self.batch_axis)
+        return source if self.batch_axis is None else source._replace(two_rows=source.labels(2, label_size(self)))
 
     def reshaped(self, row_shape: Sequence[int], batch_axis: int | None) -> Array:
         """Return the array in another shape of the graph, with its batch axis there."""
-        return self.moved(self.source.positions.reshape(row_shape), batch_axis)
+        return self.moved(Source(self.source.positions.reshape(row_shape), batch_axis))
 
-    def moved(self, positions: np.ndarray, batch_axis: int | None) -> Array:
-        """Return the numbers at these positions of the base. They are a view if NumPy made the positions as a view of `source`."""
-        if np.may_share_memory(positions, self.source.positions):
-            return Array(self.base._node, batch_axis, self.base, positions)
+    def moved(self, moved: Source) -> Array:
+        """Return the numbers at these positions of the base. They are a view if NumPy made them as a view of `source`.
+
+        Two rows tell, if there are any: in a single row, NumPy makes views that would be copies of several.
+        """
+        positions, batch_axis, two_rows = moved
+        old = self.source
+        shared = (positions, old.positions) if two_rows is None or old.two_rows is None else (two_rows, old.two_rows)
+        if np.may_share_memory(*shared):
+            return Array(self.base._node, batch_axis, self.base, positions, two_rows)
         return Array(current_builder().gather(self.base.node, positions), batch_axis)
+
+    def __pos__(self) -> Array:
+        return self.copy()
 
     def copy(self) -> Array:
         return Array(self.node, self.batch_axis)
@@ -164,14 +181,14 @@ class Array(_ArrayLike):
     def __getitem__(self, index: Any) -> Any:
         entries = self._entries(index)
         if entries and is_mask(entries[0]):
-            return Masked(self[masked_index(self.layout, entries)], entries[0])
+            return Masked(self[masked_index(self.layout, entries)].copy(), entries[0])
         if any(isinstance(entry, Array) for entry in entries):
             positions = computed_positions(self.layout, entries, as_array)
             return Array(current_builder().take(self.node, positions.node), positions.batch_axis)
         if self.batch_axis is not None and isinstance([e for e in entries if e is not None][self.batch_axis], int):
             shape = np.empty(self.row_shape)[tuple(0 if isinstance(entry, int) else entry for entry in entries)].shape
             return Array(current_builder().add("first_row", (), shape, self.kind), None)
-        return self.moved(*fixed_index(self.source, entries))
+        return self.moved(fixed_index(self.source, entries))
 
     def select(self, axis: int, index: Any) -> Any:
         """Return x[index] along an axis that is counted from the front."""
@@ -189,6 +206,9 @@ class Array(_ArrayLike):
             self[masked_index(self.layout, entries)] = elementwise("where", mask, value, region.values)
         elif any(isinstance(entry, Array) for entry in entries):
             positions = computed_positions(self.layout, entries, as_array)
+            if self.batch_axis is None and positions.batch_axis is not None:
+                text = "x[i] = y, where i differs from row to row and x is the same for all rows: make x with the shape (batch, n)"
+                raise RefusedError("E-ROWS", text)
             current_builder().check_size((math.prod(positions.row_shape), math.prod(self.row_shape)))
             values = broadcast(as_array(value), positions.shape)
             self[...] = Array(overwrite(self.node, positions.node, values.node), self.batch_axis)
@@ -196,7 +216,7 @@ class Array(_ArrayLike):
             base, builder = self.base, current_builder()
             if base.read_only:
                 raise ValueError("the inputs cannot be written into: copy them first, x = observation.copy()")
-            positions, batch_axis = fixed_index(self.source, entries)
+            positions, batch_axis, _ = fixed_index(self.source, entries)
             values = broadcast(as_array(value), Layout(positions.shape, batch_axis).shape)
             sources = all_positions(base.row_shape)
             sources.reshape(-1)[positions.reshape(-1)] = sources.size + np.arange(positions.size)
@@ -205,6 +225,11 @@ class Array(_ArrayLike):
     def _entries(self, index: Any) -> list[Any]:
         items = index if isinstance(index, tuple) else (index,)
         return index_entries(self.layout, [as_array(x) if isinstance(x, (list, tuple, range)) else x for x in items])
+
+
+def label_size(base: Array) -> int:
+    """Return what the labels of a row's numbers are less than, for `Source.labels`. One label is left over, for zeros."""
+    return math.prod(base.row_shape) + 1
 
 
 class Masked(_ArrayLike):
@@ -287,9 +312,11 @@ def power(x: Any, exponent: Any) -> Any:
     x = x if isinstance(x, Operand) else as_array(x)
     if isinstance(value, float) or getattr(x, "kind", None) == "bool":
         x = elementwise("multiply", x, 1.0 if isinstance(value, float) else 1)
+    if value == 1:
+        return +x  # a copy: a program may write into it
     square = elementwise("multiply", x, x)
     if value <= 2:
-        return x if value == 1 else square
+        return square
     return elementwise("multiply", square, x if value == 3 else square)
 
 
@@ -315,7 +342,7 @@ def rearrange(function: Callable[..., Any], arrays: Any, *args: Any) -> Any:
     builder.spend(builder.check_size([sum(sizes)]))
     if len(inputs) == 1:
         base = inputs[0].base
-        nodes, sources, size = [base.node], [inputs[0].source], math.prod(base.row_shape)
+        nodes, sources, size = [base.node], [inputs[0].source], label_size(base) - 1
     else:
         starts, size = itertools.accumulate(sizes, initial=0), sum(sizes)
         nodes = [array.node for array in inputs]
@@ -324,10 +351,10 @@ def rearrange(function: Callable[..., Any], arrays: Any, *args: Any) -> Any:
     moved = move(function, map_leaves(lambda _: next(remaining), arrays), args, size + 1)
 
     def to_array(source: Source) -> Array:
-        positions, batch_axis = source
+        positions, batch_axis, _ = source
         has_zeros = positions.min() < 0
         if len(inputs) == 1 and not has_zeros:
-            return inputs[0].moved(positions, batch_axis)
+            return inputs[0].moved(source)
         zeros = [builder.cast(builder.constant(0), widest([builder.nodes[i].kind for i in nodes]))] if has_zeros else []
         return Array(builder.gather(builder.concat([*nodes, *zeros]), positions % (size + 1)), batch_axis)
 

@@ -50,7 +50,11 @@ class BatchSize:
         return hash(self.factor)
 
     __rmul__ = __mul__
-    __le__ = __bool__ = __index__ = __int__ = __float__ = __neg__ = __abs__ = __round__ = refuse
+
+    def __bool__(self) -> bool:
+        return True
+
+    __le__ = __index__ = __int__ = __float__ = __neg__ = __abs__ = __round__ = refuse
     __add__ = __radd__ = __sub__ = __rsub__ = __truediv__ = __rtruediv__ = __rfloordiv__ = refuse
     __mod__ = __rmod__ = __pow__ = __rpow__ = __divmod__ = refuse
 

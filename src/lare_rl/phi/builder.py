@@ -154,6 +154,8 @@ class Builder:
         elif kind == "bool" and op in ("sum", "prod"):
             x, kind = self.cast(x, "int"), "int"
         self.spend(math.prod(node.shape))
+        if not axes:  # ONNX would reduce all axes
+            return x
         shape = tuple(size for axis, size in enumerate(node.shape) if axis not in axes)
         axes_from_end = tuple(axis - len(node.shape) for axis in axes)
         return self.add(op, [x], shape, kind, axes_from_end[0] if op.startswith("arg") else axes_from_end)

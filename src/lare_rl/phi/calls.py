@@ -188,7 +188,7 @@ def decorate(runtime: Runtime, value: Any, decorators: Sequence[ast.expr], scope
         name = decorator.name if isinstance(decorator, Symbol) else ""
         if name == "dataclasses.dataclass" and isinstance(value, Class):
             fields = (field for cls in (*reversed(value.bases), value) for field in cls.fields or ())
-            value.fields = list(dict.fromkeys(fields))
+            value.fields, value.is_dataclass = list(dict.fromkeys(fields)), True
         elif name not in IGNORED_DECORATORS:
             decorator = runtime.evaluate(node, scope) if isinstance(node, ast.Call) else decorator
             value = runtime.call(decorator, [value], {})

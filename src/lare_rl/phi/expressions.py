@@ -8,6 +8,7 @@ from typing import Any
 from lare_rl.phi.arrays import Array, Complex, as_array
 from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.calls import define_function, super_object
+from lare_rl.phi.comparisons import compare
 from lare_rl.phi.limits import MAX_INT_BITS, RefusedError
 from lare_rl.phi.numpy_functions import INDEXED, call_numpy
 from lare_rl.phi.operand import Operand
@@ -20,11 +21,6 @@ __all__ = ["apply_binary", "evaluate", "get_item", "list_items", "test_truth"]
 NUMBERS = (bool, int, float, complex)
 UNARY: dict[type[ast.unaryop], Callable[[Any], Any]] = {
     ast.USub: operator.neg, ast.UAdd: operator.pos, ast.Invert: operator.invert,
-}  # fmt: skip
-COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
-    ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt, ast.GtE: operator.ge, ast.Eq: operator.eq,
-    ast.NotEq: operator.ne, ast.Is: operator.is_, ast.IsNot: operator.is_not, ast.In: lambda x, y: x in y,
-    ast.NotIn: lambda x, y: x not in y,
 }  # fmt: skip
 GENERIC_TYPES = ("list", "tuple", "dict", "set", "type")
 """Types that annotations index: list[float]."""
@@ -65,18 +61,6 @@ def apply_binary(runtime: Runtime, op: ast.operator, x: Any, y: Any) -> Any:
     return combine_values(runtime.meter, name, x, y)
 
 
-def _compare(runtime: Runtime, op: ast.cmpop, x: Any, y: Any) -> Any:
-    runtime.meter.pay_for_all_within([x, y])
-    if isinstance(op, (ast.In, ast.NotIn)):
-        if isinstance(x, Operand) and isinstance(y, (list, tuple)):
-            return any(runtime.truth(x == item) for item in y) == isinstance(op, ast.In)
-    elif not isinstance(op, (ast.Is, ast.IsNot)) and isinstance(x, Operand) != isinstance(y, Operand):
-        if x is None or y is None:
-            return isinstance(op, ast.NotEq)
-        x, y = (value if isinstance(value, Operand) else as_array(value) for value in (x, y))
-    return COMPARISONS[type(op)](x, y)
-
-
 def get_item(runtime: Runtime, container: Any, index: Any) -> Any:
     runtime.meter.pay_for_all_within([index])
     match container:
@@ -104,6 +88,11 @@ def get_item(runtime: Runtime, container: Any, index: Any) -> Any:
 
 def test_truth(runtime: Runtime, value: Any) -> bool:
     runtime.meter.pay()
+    if isinstance(value, Instance):
+        for method in ("__bool__", "__len__"):
+            if value.cls.has(method):
+                return bool(runtime.call(runtime.attribute(value, method), [], {}))
+        return not value.cls.is_tuple or bool(value.cls.fields)
     return bool(value)
 
 
@@ -202,7 +191,9 @@ def _evaluate_call(runtime: Runtime, node: ast.Call, scope: Scope) -> Any:
         kwargs |= more
         runtime.meter.pay(len(more))
     runtime.line = runtime.builder.line = node.lineno
-    return runtime.call(function, args, kwargs)
+    result = runtime.call(function, args, kwargs)
+    runtime.line = runtime.builder.line = node.lineno  # a function of the program has lines of its own
+    return result
 
 
 def _evaluate_entries(runtime: Runtime, nodes: Sequence[ast.expr], scope: Scope) -> list[Any]:
@@ -221,10 +212,11 @@ def _evaluate_dict(
     runtime: Runtime, keys: Sequence[ast.expr | None], values: Sequence[ast.expr], scope: Scope
 ) -> dict[Any, Any]:
     result: dict[Any, Any] = {}
-    for key, node in zip(keys, values, strict=True):
+    for key_node, node in zip(keys, values, strict=True):
+        key = None if key_node is None else check_key(runtime.evaluate(key_node, scope))
         value = runtime.evaluate(node, scope)
-        if key is not None:
-            result[check_key(runtime.evaluate(key, scope))] = value
+        if key_node is not None:
+            result[key] = value
         elif isinstance(value, dict):  # {**other}
             result |= value
             runtime.meter.pay_for_list(len(result))
@@ -262,7 +254,7 @@ def _evaluate_comparison(
         if i and not runtime.truth(result):
             break
         y = runtime.evaluate(comparator, scope)
-        result, x = _compare(runtime, op, x, y), y
+        result, x = compare(runtime, op, x, y), y
     return result
 
 

@@ -40,7 +40,8 @@ def index_entries(layout: Layout, items: Sequence[Any]) -> list[Any]:
         if item is ...:
             entries.extend([ALL] * (layout.ndim - n_axes))
         elif item is None or isinstance(item, slice):
-            entries.append(None if item is None else _read_slice(item))
+            axis = sum(entry is not None for entry in entries)
+            entries.append(None if item is None else _read_slice(item, layout.shape[axis]))
         elif is_mask(item) and item.constant is not None:
             start = sum(entry is not None for entry in entries)
             if item.row_shape != layout.row_shape[start : start + item.ndim]:
@@ -55,20 +56,22 @@ def index_entries(layout: Layout, items: Sequence[Any]) -> list[Any]:
     return entries
 
 
-def _read_slice(entry: slice) -> slice:
-    stop = None if isinstance(entry.stop, BatchSize) and entry.start in (None, 0) else entry.stop
+def _read_slice(entry: slice, length: Any) -> slice:
+    """Return a slice of an axis of this length. The end of a batch axis is its length."""
+    is_end = isinstance(entry.stop, BatchSize) and isinstance(length, BatchSize) and entry.stop.factor == length.factor
+    stop = None if is_end and entry.start in (None, 0) else entry.stop
     return slice(*(None if end is None else operator.index(end) for end in (entry.start, stop, entry.step)))
 
 
-def fixed_index(source: Source, entries: Sequence[Any]) -> tuple[np.ndarray, int | None]:
-    """Return the positions that an index selects, and where the batch axis then is.
+def fixed_index(source: Source, entries: Sequence[Any]) -> Source:
+    """Return the positions that an index selects.
 
     Raises:
         RefusedError: it selects rows of the batch, or too many numbers.
     """
     layout = source.layout
     axes = [entry for entry in entries if entry is not None]
-    if layout.batch_axis is not None and axes[layout.batch_axis] not in (ALL, slice(0, None), slice(0, None, 1)):
+    if layout.batch_axis is not None and not _is_all(axes[layout.batch_axis]):
         raise RefusedError("E-ROWS", f"an index into the rows of {layout.shape} takes one row for all: write x[:, i]")
     # NumPy finds the shape on an array without numbers: the batch axis, or else a last axis, has the length 0.
     at = layout.ndim if layout.batch_axis is None else layout.batch_axis
@@ -76,7 +79,15 @@ def fixed_index(source: Source, entries: Sequence[Any]) -> tuple[np.ndarray, int
     shape = np.empty((*layout.row_shape[:at], 0, *layout.row_shape[at + 1 :]))[index].shape
     is_empty = shape.count(0) > 1
     current_builder().spend(current_builder().check_size([0 if is_empty else max(size, 1) for size in shape]))
-    return np.asarray(source.positions[tuple(entries)]), None if layout.batch_axis is None else shape.index(0)
+    if layout.batch_axis is None:
+        return Source(np.asarray(source.positions[tuple(entries)]), None)
+    two_rows = None if source.two_rows is None else source.two_rows[tuple(entries)]
+    return Source(source.positions[tuple(entries)], shape.index(0), two_rows)
+
+
+def _is_all(entry: Any) -> bool:
+    is_slice = isinstance(entry, slice)
+    return is_slice and entry.start in (None, 0) and entry.stop is None and entry.step in (None, 1)
 
 
 def masked_index(layout: Layout, entries: Sequence[Any]) -> tuple[Any, ...]:
@@ -101,7 +112,7 @@ def computed_positions(layout: Layout, entries: Sequence[Any], as_array: Callabl
         axis = None if entry is None else next(axes)
         size, stride = (1, 0) if axis is None else (layout.row_shape[axis], math.prod(layout.row_shape[axis + 1 :]))
         if axis is not None and axis == layout.batch_axis:
-            if entry is None or not getattr(entry, "is_row_number", False) or math.prod(entry.row_shape) != size:
+            if entry is None or not getattr(entry, "is_row_number", False) or not _counts_up(entry, size):
                 raise RefusedError("E-ROWS", "an index that differs from row to row is x[np.arange(len(x)), i]")
             rows = as_array(np.arange(size) * stride).reshaped(entry.row_shape, entry.batch_axis)
             computed = rows + computed
@@ -116,6 +127,11 @@ def computed_positions(layout: Layout, entries: Sequence[Any], as_array: Callabl
     starts = starts.reshape((*starts.shape[:before], *[1] * computed.ndim, *starts.shape[before:]))
     batch_axis = None if computed.batch_axis is None else before + computed.batch_axis
     return computed.reshaped((*[1] * before, *computed.row_shape, *[1] * behind), batch_axis).copy() + starts
+
+
+def _counts_up(row_number: Any, size: int) -> bool:
+    """Return whether a view of row numbers has each of them once, in order."""
+    return np.array_equal(row_number.source.positions.ravel(), np.arange(size))
 
 
 def overwrite(old: int, positions: int, values: int) -> int:

@@ -23,7 +23,7 @@ from lare_rl.phi.limits import (
     PARSER_STACK_BYTES,
     RefusedError,
 )
-from lare_rl.phi.runtime import Meter
+from lare_rl.phi.runtime import BUILTINS, Meter
 from lare_rl.phi.values import (
     PYTHON_ERRORS,
     BreakSignal,
@@ -155,6 +155,8 @@ def _unavailable_names(tree: ast.Module, module: Scope) -> list[str]:
             names.append(root.attr)
             root = root.value
         owner = module.get(root.id) if isinstance(root, ast.Name) else None
+        if isinstance(owner, Symbol) and owner.name in BUILTINS:
+            continue  # the name of a function of Python may be that of a variable here
         try:
             for name in reversed(names):
                 owner = symbol_attribute(owner.name, name) if isinstance(owner, Symbol) else None

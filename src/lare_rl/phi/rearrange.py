@@ -24,6 +24,8 @@ class Source(NamedTuple):
 
     positions: np.ndarray
     batch_axis: int | None
+    two_rows: np.ndarray | None = None
+    """The same view of the labels of two rows. It shares memory with other views as the arrays of the program do."""
 
     @property
     def layout(self) -> Layout:
@@ -33,6 +35,8 @@ class Source(NamedTuple):
         """Return the labels of some rows. Numbers without a batch axis count as a row behind all others."""
         if self.batch_axis is None:
             return np.asarray(self.positions + n_rows * size)
+        if n_rows == 2 and self.two_rows is not None:
+            return self.two_rows
         return np.concatenate([self.positions + row * size for row in range(n_rows)], self.batch_axis)
 
 
@@ -98,7 +102,7 @@ def _to_source(positions: np.ndarray, two_rows: np.ndarray, three_rows: np.ndarr
             (labels == expected) | (shared & (labels % size == expected % size))
         ):
             raise ValueError("rows differ")
-    return source
+    return source._replace(two_rows=two_rows)
 
 
 def _plain(value: Any, n_rows: int) -> Any:

@@ -79,6 +79,8 @@ def check_text(text: str) -> str:
 
 def check_key(value: Any) -> Any:
     """Return a value that can be the key of a dictionary. Raises `TypeError` for others."""
+    if isinstance(value, Array) and not value.ndim and value.constant is not None:
+        value = value.number()
     items = value if isinstance(value, tuple) else (value,)
     if len(items) > MAX_KEY_LENGTH or not all(
         isinstance(item, (str, bool, int, float, Symbol)) or item is None for item in items

@@ -8,9 +8,10 @@ import sys
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from lare_rl.phi.arrays import Array
+from lare_rl.phi.arrays import Array, Masked
 from lare_rl.phi.attributes import resolve_import
 from lare_rl.phi.calls import decorate, define_function, make_class
+from lare_rl.phi.graph import widest
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.python_functions import ERRORS
 from lare_rl.phi.runtime import Runtime, check_key
@@ -21,6 +22,7 @@ from lare_rl.phi.values import (
     Class,
     ContinueSignal,
     Instance,
+    Iterator,
     ProgramError,
     ReturnSignal,
     Scope,
@@ -62,11 +64,11 @@ def _execute(runtime: Runtime, statement: ast.stmt, scope: Scope) -> None:
         case ast.If(test=test, body=body, orelse=orelse):
             runtime.run(body if runtime.truth(runtime.evaluate(test, scope)) else orelse, scope)
         case ast.For(target=target, iter=iterable, body=body, orelse=orelse):
-            items = runtime.items(runtime.evaluate(iterable, scope))
+            value = runtime.evaluate(iterable, scope)
+            items = _next_items(runtime, value) if isinstance(value, Iterator) else runtime.items(value)
             _loop(runtime, (runtime.assign(target, item, scope) for item in items), body, orelse, scope)
         case ast.While(test=test, body=body, orelse=orelse):
-            turns = iter(lambda: runtime.truth(runtime.evaluate(test, scope)), False)
-            _loop(runtime, turns, body, orelse, scope)
+            _loop(runtime, _while_turns(runtime, test, scope), body, orelse, scope)
         case ast.FunctionDef() | ast.ClassDef():
             is_function = isinstance(statement, ast.FunctionDef)
             value = define_function(runtime, statement, scope) if is_function else make_class(runtime, statement, scope)
@@ -109,6 +111,22 @@ def _check_manager(runtime: Runtime, manager: ast.withitem, scope: Scope) -> Non
         raise RefusedError("E-PYTHON", "with is available for np.errstate only")
 
 
+def _next_items(runtime: Runtime, iterator: Iterator) -> Iterable[Any]:
+    """Yield the entries of an iterator. A loop that is left early leaves the others in it."""
+    while iterator:
+        runtime.meter.pay(len(iterator) // 100)
+        yield iterator.pop(0)
+
+
+def _while_turns(runtime: Runtime, test: ast.expr, scope: Scope) -> Iterable[None]:
+    line = runtime.line
+    while True:
+        runtime.line = runtime.builder.line = line  # the body has its own
+        if not runtime.truth(runtime.evaluate(test, scope)):
+            return
+        yield
+
+
 def _loop(
     runtime: Runtime, turns: Iterable[Any], body: Sequence[ast.stmt], orelse: Sequence[ast.stmt], scope: Scope
 ) -> None:
@@ -133,22 +151,25 @@ def assign(runtime: Runtime, target: ast.expr, value: Any, scope: Scope) -> None
         case ast.Tuple(elts=targets) | ast.List(elts=targets):
             items = list(runtime.items(value))
             starred = next((i for i, item in enumerate(targets) if isinstance(item, ast.Starred)), None)
-            if starred is not None:
+            if starred is not None and len(items) >= len(targets) - 1:
                 end = len(items) - (len(targets) - starred - 1)
                 items = [*items[:starred], items[starred:end], *items[end:]]
-            if len(items) != len(targets):
+            if len(items) != len(targets) or (starred is not None and not isinstance(items[starred], list)):
                 raise ValueError(f"{len(items)} values are unpacked into {len(targets)} names")
             for item, entry in zip(targets, items, strict=True):
                 runtime.assign(item.value if isinstance(item, ast.Starred) else item, entry, scope)
         case ast.Subscript(value=container, slice=index):
             _set_item(runtime, runtime.evaluate(container, scope), runtime.evaluate(index, scope), value)
-        case ast.Attribute(value=owner_node, attr=name):
-            owner = runtime.evaluate(owner_node, scope)
-            if not isinstance(owner, (Instance, Class)):
-                raise RefusedError("E-PYTHON", f".{name} of {describe(owner)} cannot be assigned")
-            owner.attributes[name] = value
+        case ast.Attribute(value=owner, attr=name):
+            _set_attribute(runtime.evaluate(owner, scope), name, value)
         case _:
             raise RefusedError("E-PYTHON", f"nothing can be assigned to {type(target).__name__.lower()}")
+
+
+def _set_attribute(owner: Any, name: str, value: Any) -> None:
+    if not isinstance(owner, (Instance, Class)):
+        raise RefusedError("E-PYTHON", f".{name} of {describe(owner)} cannot be assigned")
+    owner.attributes[name] = value
 
 
 def _set_item(runtime: Runtime, container: Any, index: Any, value: Any) -> None:
@@ -167,6 +188,9 @@ def _augment(runtime: Runtime, statement: ast.AugAssign, scope: Scope) -> None:
     if isinstance(target, ast.Subscript):
         container, index = runtime.evaluate(target.value, scope), runtime.evaluate(target.slice, scope)
         old = runtime.item(container, index)
+    elif isinstance(target, ast.Attribute):
+        container = runtime.evaluate(target.value, scope)
+        old = runtime.attribute(container, target.attr)
     else:
         old = runtime.evaluate(target, scope)
     operand = runtime.evaluate(statement.value, scope)
@@ -179,13 +203,24 @@ def _augment(runtime: Runtime, statement: ast.AugAssign, scope: Scope) -> None:
         old.clear()
         old.update(new)
     elif isinstance(target, ast.Subscript):
+        if isinstance(container, Array):
+            _check_in_place(container, new)
         _set_item(runtime, container, index, new)
     elif isinstance(old, Array) and old.ndim:
-        if isinstance(new, Array) and new.kind == "float" != old.kind:
-            raise TypeError("an array of integers or truth values cannot take fractions in place: use x = x + y")
+        _check_in_place(old, new)
         old[...] = new
+    elif isinstance(target, ast.Attribute):
+        _set_attribute(container, target.attr, new)
     else:
         runtime.assign(target, new, scope)
+
+
+def _check_in_place(old: Array, new: Any) -> None:
+    """Raise `TypeError` if NumPy would not put the result of `x += y` into x."""
+    if isinstance(new, (Array, Masked)) and widest([old.kind, new.kind]) != old.kind:
+        raise TypeError(
+            f"an array of the kind {old.kind} cannot take numbers of the kind {new.kind} in place: use x = x + y"
+        )
 
 
 def _delete(runtime: Runtime, target: ast.expr, scope: Scope) -> None:

@@ -68,6 +68,7 @@ class Class(_Value):
     fields: Sequence[str] | None = None
     """Names of the fields of a dataclass or of a named tuple, in order."""
     is_tuple: bool = False
+    is_dataclass: bool = False
 
     def find(self, name: str) -> Any:
         """Return an attribute of the class or of its bases. Raises `AttributeError` if none of them has it."""

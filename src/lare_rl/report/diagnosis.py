@@ -175,7 +175,7 @@ def _one_seed_was_better(run: RunSummary) -> Finding | None:
     trained_returns = np.where(run.steps > run.warmup, run.returns, -np.inf)  # -inf before the first update
     seed_index, best = np.unravel_index(np.nanargmax(trained_returns), run.returns.shape)
     return_ = float(trained_returns[seed_index, best])
-    if return_ <= run.random_mean + EVALUATION_STDS * run.random_std:
+    if return_ <= run.random_mean + EVALUATION_STDS * run.random_std or not run.has_best_policy:
         return None
     values = {"step": int(run.steps[best]), "return_": return_, "directory": run.directory}
     return Finding("one_seed_was_better", values)
@@ -183,7 +183,7 @@ def _one_seed_was_better(run: RunSummary) -> Finding | None:
 
 def _has_fallen(run: RunSummary) -> Finding | None:
     """Report the best evaluation, if the last quarter is clearly below it."""
-    if run.trend is None:
+    if run.trend is None or not run.has_best_policy:
         return None
     _, last, change = run.trend
     step, best = run.best_evaluation
@@ -230,7 +230,9 @@ def _needs_baseline(run: RunSummary) -> Finding | None:
         return None
     step, return_ = run.best_evaluation
     best = Finding("best_evaluation", {"step": step, "return_": return_, "directory": run.directory})
-    is_better = return_ - run.judged_return > BETTER_FRACTION * (run.judged_return - run.random_mean)
+    is_better = run.has_best_policy and return_ - run.judged_return > BETTER_FRACTION * (
+        run.judged_return - run.random_mean
+    )
     return Finding("needs_baseline", {"best": best if is_better else None})
 
 

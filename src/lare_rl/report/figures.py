@@ -83,10 +83,22 @@ def draw_bands(
 def draw_bands_on(axes: Axes, bands: Mapping[str, Band], x_is_steps: bool) -> None:
     """Draw curves as `draw_bands` does, on axes of a figure."""
     for (line, colour), (name, (x, y, low, high)) in zip(cycle(_LINES), bands.items(), strict=False):
-        axes.plot(x, y, color=colour, linestyle=line, label=name, drawstyle="default" if x_is_steps else "steps-post")
+        axes.plot(
+            x,
+            y,
+            color=colour,
+            linestyle=line,
+            label=_to_label(name),
+            drawstyle="default" if x_is_steps else "steps-post",
+        )
         axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0, step=None if x_is_steps else "post")
     if x_is_steps:
         axes.xaxis.set_major_formatter(lambda x, _: format_for_reader(x, "steps"))
+
+
+def _to_label(name: str) -> str:
+    """Return a name as Matplotlib's label: `$` is no formula, and a name that begins with `_` is not left out."""
+    return (f" {name}" if name.startswith("_") else name).replace("$", r"\$")
 
 
 def _add_legend(axes: Axes) -> None:

@@ -13,13 +13,11 @@ from lare_rl.report.html import render_note, write_page
 from lare_rl.report.overview import render_learning_curves, render_verdict, summarise_runs
 from lare_rl.report.reported_run import ReportedRun
 from lare_rl.runs.config_file import read_config
-from lare_rl.runs.directory import open_without_functions
+from lare_rl.runs.directory import LIVE_PAGE, open_without_functions
 from lare_rl.training.progress import Listener, MetricLines
 
-__all__ = ["PAGE", "LivePage"]
+__all__ = ["LivePage"]
 
-PAGE = "watch.html"
-"""The file in the run's directory."""
 REFRESH_S = 10
 """Seconds after which a browser reloads the page."""
 
@@ -40,7 +38,7 @@ class LivePage(Listener):
         self._is_running = True
         self._write()
         if self._browser:
-            webbrowser.open((self._directory / PAGE).resolve().as_uri())
+            webbrowser.open((self._directory / LIVE_PAGE).resolve().as_uri())
 
     def on_evaluation(self, metrics: MetricLines) -> None:
         if self._random_returns is None:  # not before the first step, because it may take minutes
@@ -67,4 +65,4 @@ class LivePage(Listener):
                 *render_learning_curves(task, [reported], random_returns),
                 render_note(f"{steps}; {state}. lare-rl report draws credit and factors too."),
             ]
-            write_page(self._directory / PAGE, title, "\n".join(sections), REFRESH_S if self._is_running else None)
+            write_page(self._directory / LIVE_PAGE, title, "\n".join(sections), REFRESH_S if self._is_running else None)

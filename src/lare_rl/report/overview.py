@@ -89,6 +89,8 @@ def render_verdict(
         yield f'<p class="headline">{MESSAGES["no_evaluation"]}</p></div></div>'
         return
     yield f'<p class="headline">{escape(render_headline(summary))}</p>'
+    if reported.run.config.task.teams:
+        yield render_note(f"Sentences and numbers are about the first team, {reported.run.config.task.roles[0].name}.")
     for subject, finding in diagnose(summary):
         if subject != "credit":
             class_ = ' class="verdict"' if subject == "next" else ""
@@ -229,13 +231,13 @@ def render_learning_curves(
 
 
 def _other_metrics(task: TaskSpec) -> Iterable[_Metric]:
-    metrics = [_Metric(f"evaluation/{name}", name.replace("_", " ").capitalize()) for name in task.measures]
-    metrics += [
+    measures = [_Metric(f"evaluation/{name}", name.replace("_", " ").capitalize()) for name in task.measures]
+    metrics = [
         _Metric(RETURN_R2, "R² of returns", (0.0, 1.0)),
         _Metric(CREDIT_CORRELATION, "Correlation of proxy and true rewards", (0.0, 1.0)),
         _Metric(CREDIT_ERROR, "Credit error: mean |proxy - true reward|"),
     ]
-    return _for_teams(metrics, task)
+    return [*measures, *_for_teams(metrics, task)]
 
 
 def _for_teams(metrics: Sequence[_Metric], task: TaskSpec) -> Sequence[_Metric]:

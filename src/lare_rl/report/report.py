@@ -25,10 +25,11 @@ from lare_rl.report.overview import (
 )
 from lare_rl.report.reported_run import ReportedRun
 from lare_rl.report.run_details import describe_method, render_details, render_settings
+from lare_rl.report.run_summary import RunSummary
 from lare_rl.runs.checkpoint import STATE_FILE
 from lare_rl.runs.directory import Run, as_run, find_run_directories, open_run, open_without_functions
 from lare_rl.tasks.trust import untrusted_module
-from lare_rl.util.files import check_new_path
+from lare_rl.util.files import check_new_path, write_bytes
 from lare_rl.util.provenance import code_version
 
 __all__ = ["default_path", "write_report"]
@@ -115,13 +116,19 @@ def _render_body(reported_runs: Sequence[ReportedRun], film: bool) -> Iterable[s
 
 def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
     """Yield the sections on runs of a task."""
+    _check_same_task(runs)
     task = runs[0].run.config.task
     n_random = max(n_random_episodes(reported.last_step, reported.run.config.longest_episode) for reported in runs)
     random_returns = measure_random_returns(task, n_random)
     summaries = summarise_runs(runs, random_returns)
     loadable = [i for i, reported in enumerate(runs) if _can_load(reported.run)]
     has_many_agents = bool(loadable) and load_env_spec(task).n_agents > 1
-    episodes = {i: play_run(runs[i].run) for i in loadable if has_many_agents}
+    episodes, errors = {}, {}
+    for i in loadable if has_many_agents else ():
+        try:
+            episodes[i] = play_run(runs[i].run)
+        except LareError as error:
+            errors[i] = error
     filmed = loadable[:MAX_FILMS] if film else []
     films = {i: _load_film(runs[i].run, episodes.get(i), FILM_BYTES // len(filmed)) for i in filmed}
     figures = {i: render_film(data, f"An episode of {runs[i].name}") for i, data in films.items() if data}
@@ -130,7 +137,7 @@ def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
         yield render_note(describe_method(runs[0].run))
         yield "<h2>Learning</h2>"
         yield from render_learning_curves(task, runs, random_returns)
-        yield from render_details(runs[0].run, render_trust(summaries[0]), episodes.get(0))
+        yield from _render_details(runs[0].run, summaries[0], episodes.get(0), errors.get(0))
         yield _note_missing(runs)
         yield render_fold("Final values of each seed", [render_final_values(runs)])
         return
@@ -144,11 +151,35 @@ def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
     yield render_final_values(runs)
     yield "<h2>Each run</h2>"
     for i, (reported, summary) in enumerate(zip(runs, summaries, strict=True)):
-        details = render_details(reported.run, render_trust(summary), episodes.get(i))
+        details = _render_details(reported.run, summary, episodes.get(i), errors.get(i))
         title = f"{reported.name}: {render_headline(summary)}" if summary else reported.name
         verdict = render_verdict(reported, summary, has_title=False)
         yield render_fold(title, [*verdict, render_note(describe_method(reported.run)), *details])
     yield _note_missing(runs)
+
+
+def _check_same_task(runs: Sequence[ReportedRun]) -> None:
+    """Raise `LareError` if two runs have different tasks of the same name."""
+    first = runs[0].run
+    for reported in runs:
+        if reported.run.config.task.digest != first.config.task.digest:
+            raise LareError(
+                f"{first.directory} and {reported.run.directory} have different tasks with the name {first.config.task.name}: draw "
+                "them separately"
+            )
+
+
+def _render_details(
+    run: Run, summary: RunSummary | None, played: PlayedEpisodes | None, error: LareError | None
+) -> list[str]:
+    """Return what a run's checkpoint and files show. If they cannot be used, say why: the rest of the report does not need them."""
+    trust = list(render_trust(summary))
+    try:
+        if error is None:
+            return list(render_details(run, trust, played))
+    except LareError as details_error:
+        error = details_error
+    return [*trust, render_note(f"There are no credit and factors to show: {error}.")]
 
 
 def _note_missing(runs: Sequence[ReportedRun]) -> str:
@@ -173,6 +204,6 @@ def _load_film(run: Run, played: PlayedEpisodes | None, max_bytes: int) -> bytes
         film = encode_film(*record_frames(run, max_frames=MAX_FRAMES, played=played), max_bytes)
     except LareError:
         return None
-    with suppress(OSError):
-        path.write_bytes(film)
+    with suppress(LareError):
+        write_bytes(path, film)
     return film

@@ -1,6 +1,7 @@
 """The summary of a run, which its diagnosis reads."""
 
 import math
+import shlex
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -101,7 +102,10 @@ class RunSummary:
     """The number of environment steps before the first update."""
     n_saturated: int = 0
     """The number of seeds whose final policy chooses the same action, with each entry at a bound, in all states."""
+    has_best_policy: bool = True
+    """Whether the best policy of each seed is kept. It is not with several teams."""
     directory: str = "RUN"
+    """Quoted for a shell."""
     task: str = "TASK"
     """The name of a shipped task, or a placeholder for a task file, which ends in `.toml`."""
 
@@ -231,7 +235,7 @@ class RunSummary:
         R^2 does not tell if the score is won or lost, because it is small however good the credit is.
         """
         if self.score_use is not None and self.score_use.is_binary:
-            return not self.score_use.is_clear
+            return math.isfinite(self.score_use.gain) and not self.score_use.is_clear
         r2s = [r2 for r2 in (self.return_r2, self.median_r2) if r2 is not None]
         return self.return_r2 is not None and max(r2s) < LITTLE_R2
 
@@ -256,7 +260,7 @@ def summarise_run(
         random_returns=random_returns if len(random_returns) > 1 else np.zeros(0),
         initial_returns=initial_returns if np.isfinite(initial_returns).all() else None,
         deterministic_returns=deterministic if len(deterministic) == len(returns) else None,
-        episode_error=_episode_error(reported),
+        episode_error=_episode_error(reported, random_returns),
         episodic=episodic,
         return_r2=_last_mean(reported, RETURN_R2),
         median_r2=float(np.median(r2s)) if len(r2s) else None,
@@ -277,17 +281,23 @@ def summarise_run(
         planned_steps=settings.steps,
         warmup=settings.warmup,
         n_saturated=int(np.sum(reported.final_values(ACTOR_SATURATION) == 1)),
-        directory=str(run.directory),
+        directory=shlex.quote(str(run.directory)),
+        has_best_policy=len(task.roles) == 1,
         task=task.name if task.name in shipped_tasks() else "TASK.toml",
     )
 
 
-def _episode_error(reported: ReportedRun) -> float:
-    """Return the standard error of the mean return of the last evaluation, from episode to episode, all seeds together."""
+def _episode_error(reported: ReportedRun, random_returns: Float[np.ndarray, " episodes"]) -> float:
+    """Return the standard error of the mean return of the last evaluation, from episode to episode, all seeds together.
+
+    Of a single episode it is unknown: returns then count as uncertain as those of random actions.
+    """
     stds = reported.final_values(RETURN_STD)
     if len(stds) < len(reported.run.seeds):
         return 0.0
     n = reported.run.config.settings.evaluation_episodes
+    if n == 1:
+        return sample_std(random_returns) / math.sqrt(len(stds))
     return episode_error(stds**2 * n / max(1, n - 1), n)  # the deviations have n in the denominator
 
 

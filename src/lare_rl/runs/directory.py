@@ -5,6 +5,7 @@ latent_function.py   phi; its replies and checks are in latent_function.json. Se
 metrics.jsonl        see metrics_file.py
 checkpoint/          see checkpoint.py
 failed_batch.npz     the input of the latent function, if it failed
+watch.html           a page that shows the run while it trains, if that was asked for
 """
 
 import contextlib
@@ -29,6 +30,7 @@ from lare_rl.util.processes import try_lock
 
 __all__ = [
     "CHECKPOINT",
+    "LIVE_PAGE",
     "Run",
     "RunBusyError",
     "as_run",
@@ -44,6 +46,8 @@ __all__ = [
 ]
 
 CHECKPOINT = "checkpoint"
+LIVE_PAGE = "watch.html"
+"""The page of `lare-rl train --watch`."""
 
 
 class RunBusyError(LareError):
@@ -223,13 +227,14 @@ def lock_run(run: Run) -> Iterator[None]:
 def find_run_directories(paths: Sequence[Path]) -> list[Path]:
     """Return the runs among some paths and up to two levels below them, in the order of the paths, each once.
 
-    The log that a sweep writes next to the directory of a run is skipped, so `DIRECTORY/*` may be passed.
+    The log that a sweep writes next to the directory of a run is skipped, so `DIRECTORY/*` may be passed: beside other paths, also the
+    log of a run that never began.
 
     Raises `LareError` if there is no path, or a path contains no run.
     """
     directories: dict[Path, Path] = {}  # by resolved path
     for path in paths:
-        if path.suffix == ".log" and path.with_suffix("").is_dir():
+        if path.suffix == ".log" and (path.with_suffix("").is_dir() or (path.is_file() and len(paths) > 1)):
             continue
         # A name that begins with a dot is the directory of a run that was killed before it was complete.
         configs = [config for depth in ("", "[!.]*/", "[!.]*/[!.]*/") for config in path.glob(depth + CONFIG)]

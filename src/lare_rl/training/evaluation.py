@@ -73,7 +73,7 @@ def metrics_lines(seeds: Sequence[int], step: int, metrics: Mapping[str, Any], r
         numbers = {name: float(np.asarray(values)[seed_index]) for name, values in metrics.items()}
         # JSON has no NaN: a correlation with a value that never varies is null.
         valid = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-        lines.append({"step": step, "seed": seed, **valid, "time/steps_per_second": round(rate, 1)})
+        lines.append({"step": step, "seed": seed, **valid, "time/steps_per_second": float(f"{rate:.3g}")})
     return lines
 
 

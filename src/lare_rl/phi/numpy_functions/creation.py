@@ -33,7 +33,15 @@ def array(object: Array, dtype: Any = None, *, copy: Any = True, ndmin: Any = 0)
     return x[(None,) * (ndmin - x.ndim)] if ndmin > x.ndim else x
 
 
-@numpy_function("asarray", "asanyarray", "ascontiguousarray", "asfortranarray", "asarray_chkfinite", "require")
+@numpy_variants({"ascontiguousarray": "c_contiguous", "asfortranarray": "f_contiguous"})
+def contiguous(flag: str, a: Array, dtype: Any = None) -> Array:
+    """Return an array, or a copy of it if its numbers are not one behind the other."""
+    positions, _, two_rows = a.source
+    is_contiguous = getattr((positions if two_rows is None else two_rows).flags, flag)
+    return asarray(a if is_contiguous else a.copy(), dtype)
+
+
+@numpy_function("asarray", "asanyarray", "asarray_chkfinite", "require")
 def asarray(a: Array, dtype: Any = None, order: Any = None) -> Array:
     return a if dtype is None or dtype_kind(dtype) == a.kind else astype(a, dtype)
 
@@ -111,7 +119,10 @@ def apply_along_axis(func1d: Callable[..., Any], axis: int, arr: Array, *args: A
     if at != arr.ndim - 1:
         raise RefusedError("E-NUMPY", "np.apply_along_axis works along the last axis: use axis=-1")
     series_of_row = Array(arr.node, None).reshaped((-1, arr.row_shape[at]), None)
-    results = stack([as_array(func1d(series, *args, **kwargs)) for series in series_of_row], 0)
+    results = [as_array(func1d(series, *args, **kwargs)) for series in series_of_row]
+    if any(result.batch_axis is not None for result in results):
+        raise RefusedError("E-ROWS", "the function of np.apply_along_axis mixes rows: it may only use its own argument")
+    results = stack(results, 0)
     return results.reshaped((*arr.row_shape[:-1], *results.row_shape[1:]), arr.batch_axis)
 
 

@@ -47,7 +47,8 @@ for _names, _function in {
     "square": lambda x: power(x, 2),
     # An integer, such as 1 / 3, is cut to 0.
     "reciprocal": lambda x: elementwise("where", abs(x) == 1, x, 0) if x.kind == "int" else 1.0 / x,
-    "positive conj conjugate real": lambda x: x,
+    "positive conj conjugate": lambda x: +x,
+    "real": lambda x: x,
     "degrees rad2deg": lambda x: x * (180 / math.pi),
     "radians deg2rad": lambda x: x * (math.pi / 180),
     "bitwise_not invert bitwise_invert": invert,
@@ -55,7 +56,10 @@ for _names, _function in {
     "isneginf": lambda x: x == -math.inf,
     "ldexp": lambda x, n: x * elementwise("exp2", n),
     "divmod": lambda x, y: (x // y, x % y),
-    "modf": lambda x: (x - elementwise("trunc", x), elementwise("trunc", x)),
+    "modf": lambda x: (
+        elementwise("where", abs(x) == math.inf, 0.0, x - elementwise("trunc", x)),
+        elementwise("trunc", x),
+    ),
     # NaN stays NaN.
     "heaviside": lambda x, at_zero: elementwise(
         "where", x == 0, at_zero, elementwise("where", x != x, x, (x > 0) * 1.0)

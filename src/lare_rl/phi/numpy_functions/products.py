@@ -170,7 +170,7 @@ def norm(x: Array, ord: Any = None, axis: Any = None, keepdims: Any = False) -> 
     x = as_numbers(x)
     axes = x.row_axes(axis)
     if len(axes) > 1 and ord is not None:
-        return _matrix_norm(x, ord, axes, keepdims)
+        return _matrix_norm(x, ord, axes if axis is None else tuple(map(x.axis, axis)), keepdims)
     return _vector_norm(x, 2 if ord is None else ord, axis, keepdims)
 
 

@@ -89,7 +89,8 @@ def _gradient_along_last_axis(f: Array, spacing: Array, edge_order: int) -> Any:
     if size > 2:
         d0, d1 = x[1:-1] - x[:-2], x[2:] - x[1:-1]
         w_before, w_middle, w_behind = -d1 / (d0 * (d0 + d1)), (d1 - d0) / (d0 * d1), d0 / (d1 * (d0 + d1))
-        pieces.append(f[..., :-2] * w_before + f[..., 1:-1] * w_middle + f[..., 2:] * w_behind)
+        inner = f[..., :-2] * w_before + f[..., 2:] * w_behind
+        pieces.append(inner + f[..., 1:-1] * w_middle if w_middle.any() else inner)  # not 0 * inf
     pieces.append((f[..., -1:] - f[..., -2:-1]) / (x[-1] - x[-2]))
     if edge_order == 2:
         for piece, (i, j, k) in ((0, (0, 1, 2)), (-1, (size - 1, size - 2, size - 3))):
@@ -174,4 +175,6 @@ def _at_fraction(ordered: Array, at: int, fraction: float, method: str) -> Any:
     if method not in weights:
         raise RefusedError("E-NUMPY", f"method={method[:40]!r}: use one of {', '.join(weights)}")
     weight = weights[method]
+    if weight == 0.5:
+        return (low + high) * 0.5  # the difference of two infinities is NaN
     return {0.0: low, 1.0: high}.get(weight, low + (high - low) * weight)

@@ -191,19 +191,22 @@ def rising_polyval(x: Array, c: Array, tensor: Any = True) -> Any:
     return polyval(c[::-1], x)
 
 
-SERIES: dict[str, Callable[[Any], np.ndarray]] = {
-    "chebyshev.chebval": np.polynomial.chebyshev.cheb2poly,
-    "legendre.legval": np.polynomial.legendre.leg2poly,
-    "hermite.hermval": np.polynomial.hermite.herm2poly,
-    "hermite_e.hermeval": np.polynomial.hermite_e.herme2poly,
-    "laguerre.lagval": np.polynomial.laguerre.lag2poly,
+SERIES: dict[str, Callable[..., Any]] = {
+    "chebyshev.chebval": np.polynomial.chebyshev.chebval,
+    "legendre.legval": np.polynomial.legendre.legval,
+    "hermite.hermval": np.polynomial.hermite.hermval,
+    "hermite_e.hermeval": np.polynomial.hermite_e.hermeval,
+    "laguerre.lagval": np.polynomial.laguerre.lagval,
 }
-"""What converts the coefficients of a series to those of powers."""
+"""Series of polynomials. NumPy's functions are recurrences of `+`, `-` and `*`, which our arrays have too."""
 
 
 @numpy_variants({f"polynomial.{name}": name for name in SERIES})
 def series_value(name: str, x: Array, c: Any, tensor: Any = True) -> Any:
-    return rising_polyval(x, as_array(SERIES[name](plain_constant(c, name, MAX_SYSTEM_SIZE))))
+    coefficients = plain_constant(c, name, MAX_SYSTEM_SIZE)
+    if np.ndim(coefficients) != 1:
+        raise RefusedError("E-NUMPY", f"np.polynomial.{name} of several series: call it for each")
+    return SERIES[name](x, coefficients)
 
 
 array_functions(

@@ -12,17 +12,21 @@ from lare_rl.phi.arrays import Array
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, builtin_variants, check_key, make_set, varies
 from lare_rl.phi.text import format_value
-from lare_rl.phi.values import Bound, Class, Iterator, Symbol
+from lare_rl.phi.values import Bound, Class, Instance, Iterator, Symbol
 
 ADDITION = Symbol("operator.add")
 
 
 @builtin("len")
-def len_(_: Runtime, x: Any) -> Any:
+def len_(runtime: Runtime, x: Any) -> Any:
     if isinstance(x, Array) and x.ndim:
         return x.shape[0]
     if isinstance(x, Class):
         return len([name for name in x.attributes if not name.startswith("_")])
+    if isinstance(x, Instance) and x.cls.has("__len__"):
+        return runtime.call(runtime.attribute(x, "__len__"), [], {})
+    if isinstance(x, Instance) and x.cls.is_tuple:
+        return len(x.cls.fields or ())
     if isinstance(x, (list, tuple, dict, range, str)):
         return len(x)
     raise TypeError("len() of a value without entries")
@@ -67,7 +71,7 @@ def _sort_key(runtime: Runtime, key: Any) -> Callable[[Any], Any] | None:
 
 
 @builtin("dict", "collections.OrderedDict")
-def dict_(runtime: Runtime, values: Any = (), **more: Any) -> dict[Any, Any]:
+def dict_(runtime: Runtime, values: Any = (), /, **more: Any) -> dict[Any, Any]:
     if isinstance(values, dict):
         runtime.meter.pay_for_list(len(values))
         return dict(values) | more
@@ -156,7 +160,8 @@ def combine(name: str, runtime: Runtime, /, *args: Any, **kwargs: Any) -> Iterat
     many = len(args) > 20 or any(isinstance(x, int) and x > 20 for x in (*args, *kwargs.values()))
     if many and name not in ("chain", "islice", "repeat"):
         raise RefusedError("E-COST", f"itertools.{name} of more than 20 entries at a time")
-    plain = [x if isinstance(x, int) or x is None else list(runtime.items(x)) for x in args]
+    is_number = name == "repeat" and len(args) > 1  # the value that is repeated, and how often
+    plain = [x if is_number or isinstance(x, int) or x is None else list(runtime.items(x)) for x in args]
     runtime.meter.pay_for_list(LENGTHS[name](*plain, **kwargs))
     return Iterator(getattr(itertools, name)(*plain, **kwargs))
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import as_array
+from lare_rl.phi.arrays import Array, as_array
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.registry import KIND_OF_DTYPE, astype, dtype_kind, dtype_name
 from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, check_text
@@ -32,9 +32,12 @@ _PARENTS = {
 def isinstance_(_: Runtime, value: Any, classes: Any) -> bool:
     classes = classes if isinstance(classes, tuple) else (classes,)
     if isinstance(value, Instance):
-        return any(cls in classes for cls in (value.cls, *value.cls.bases)) or Symbol("object") in classes
+        types = [value.cls, *value.cls.bases, Symbol("object"), *([Symbol("tuple")] if value.cls.is_tuple else [])]
+        return any(cls in classes for cls in types)
     name = value_type(value).name
-    names = (name, "object", *_PARENTS.get(name, ()))
+    names = [name, "object", *_PARENTS.get(name, ())]
+    if isinstance(value, Array) and not value.ndim and value.constant is not None and value.kind == "float":
+        names += ["float", "np.floating", "np.float64", *_PARENTS["float"]]  # a number of NumPy
     return any(isinstance(cls, Symbol) and cls.name in names for cls in classes)
 
 
@@ -82,9 +85,24 @@ def issubdtype(_: Runtime, dtype: Any, kind: Any) -> bool:
     return names[1] in ("number", "generic") or KIND_OF_DTYPE.get(names[0]) == KIND_OF_DTYPE.get(names[1], "")
 
 
-@builtin("np.vectorize", "np.frompyfunc")
-def vectorize(runtime: Runtime, function: Any, *_: Any, **__: Any) -> Bound:
-    return Bound(lambda *args, **kwargs: runtime.call(function, [as_array(x) for x in args], kwargs))
+@builtin("np.frompyfunc")
+def frompyfunc(runtime: Runtime, function: Any, nin: int, nout: int) -> Bound:
+    return vectorize(runtime, function)
+
+
+@builtin("np.vectorize")
+def vectorize(runtime: Runtime, pyfunc: Any, otypes: Any = None, doc: Any = None, **_: Any) -> Bound:
+    """Return a function of arrays. What it computes is computed with whole arrays, and so for each number."""
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        result = runtime.call(pyfunc, [as_array(x) for x in args], kwargs)
+        if not otypes:
+            return result
+        if isinstance(result, (tuple, list)):
+            return tuple(astype(x, dtype) for x, dtype in zip(result, otypes, strict=True))
+        return astype(as_array(result), otypes[0])
+
+    return Bound(call)
 
 
 def _conversion(dtype: str) -> Callable[..., Any]:
