@@ -24,6 +24,7 @@ def test_study():
     assert [job.directory.name for job in jobs] == ["dense-td3", "bayes-td3", "lare-bayes-td3-draw0"]
 
 
+@pytest.mark.long
 def test_offline_td3_bc(tmp_path):
     # A few updates on each kind of rewards. That it learns takes longer than a test.
     pytest.importorskip("torch")

@@ -137,6 +137,7 @@ def test_rewards_can_be_scaled():
     np.testing.assert_allclose(scaled * scale, plain, rtol=1e-4)
 
 
+@pytest.mark.long
 def test_explanation_of_noise():
     """A fit to prefixes has a column for the time, which is not the return."""
     credit, random = small_assigner("bayes-progress"), np.random.default_rng(0)
@@ -146,7 +147,7 @@ def test_explanation_of_noise():
     assert explain(credit.learner).total_r2 < 0.3
 
 
-@pytest.mark.parametrize("start_value", [True, False])
+@pytest.mark.parametrize("start_value", [True, long_case(False)])
 def test_no_step_is_paid_for_the_start_value_of_a_sum(start_value, phi):
     settings = SMALL_CREDIT.model_copy(update={"score": "auto", "start_value": start_value})
     credit, episodes = small_assigner("lare-linear", phi, settings=settings), random_episodes([14, 3, 8, 5] * 15)
@@ -158,7 +159,7 @@ def test_no_step_is_paid_for_the_start_value_of_a_sum(start_value, phi):
     assert credit.metrics()["credit/return_r2"] > 0.9 or not start_value
 
 
-@pytest.mark.parametrize("groups", [False, True])
+@pytest.mark.parametrize("groups", [long_case(False), True])
 def test_gradient_decoders_pay_no_step_for_the_start_value(groups):
     settings = SMALL_CREDIT.model_copy(update={"score": "auto", "learning_rate": 0.01, "steps": 100})
     credit = small_assigner("rd", settings=settings, groups=groups)
@@ -530,7 +531,7 @@ SCORES = {
 """Scores of the observations after the steps of an episode."""
 
 
-@pytest.mark.parametrize("score", SCORES)
+@pytest.mark.parametrize("score", ["largest", long_case("smallest"), long_case("sum")])
 def test_must_learn_scores_that_are_no_sum(score):
     """The history predicts new scores, and is worse than sums nowhere. The steps that make the score get the rewards."""
     sums, history = small_assigner("bayes"), small_assigner("bayes-history")
@@ -651,6 +652,7 @@ def test_end_needs_the_group_of_a_step():
     assert list(credit.store.running) == ["c"]
 
 
+@pytest.mark.long
 def test_must_learn_what_wins():
     """Steps that raise the odds of a win get credit for it, and chances are predicted better than by a sum."""
     rng = np.random.default_rng(0)

@@ -90,7 +90,9 @@ EVERY_5, WINDOW = PaymentRule(period=5), PaymentRule(period=4, window=6)
 @pytest.mark.parametrize(
     ("method", "env", "changes"),
     [
-        ("lare-bayes-history", PHI_ENV, {"score": "auto", "payments": EVERY_5, "exact": "spread", "n_running": 4}),
+        long_case(
+            "lare-bayes-history", PHI_ENV, {"score": "auto", "payments": EVERY_5, "exact": "spread", "n_running": 4}
+        ),
         long_case("bayes-progress", ONE_TEAM, {"exact": "spread"}),
         long_case("bayes-progress", ONE_AGENT, {"exact": "last", "n_running": 11}),
         long_case("bayes", ONE_AGENT, {"score": "binary", "group": "map"}),

@@ -68,6 +68,7 @@ def test_a_tenth_is_dropped():
     np.testing.assert_array_equal(rbt._dropout(x, None), x)
 
 
+@pytest.mark.long
 def test_must_learn_rewards_and_next_states(monkeypatch):
     """Rewards are linear in state and action. The next state is the action. Three layers take seconds to compile."""
     monkeypatch.setattr(rbt, "LAYERS", 1)

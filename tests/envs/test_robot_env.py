@@ -86,7 +86,7 @@ def test_ends_and_sums():
 @pytest.mark.parametrize(
     ("environment", "arguments", "sizes", "ends"),
     [
-        ("brax/inverted_pendulum", {"backend": "spring"}, (4, 1, 30), True),
+        long_case("brax/inverted_pendulum", {"backend": "spring"}, (4, 1, 30), True),
         long_case("playground/PendulumSwingup", {"episode_length": 3}, (3, 1, 3), False),
     ],
 )

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from helpers.long_tests import long_case
+
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {
     "cleanrl_td3.py": {"total_timesteps": 240, "learning_starts": 200, "batch_size": 16, "buffer_size": 1000},
@@ -30,7 +32,7 @@ def run(path, **changes):
     return module["main"](module["Args"](**settings))
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
+@pytest.mark.parametrize("name", ["cleanrl_ppo.py", long_case("cleanrl_td3.py")])
 def test_scripts_use_proxy_rewards(name, tmp_path):
     """With dense rewards, a script does the same as without the lines that LaRe adds. With proxy rewards, it does not."""
     (tmp_path / name).write_text("".join(plain_lines(name)), encoding="utf-8")

@@ -331,6 +331,7 @@ def test_terminated_command_leaves_nothing(command, folder, tmp_path, monkeypatc
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.long
 def test_predictions_of_odds_are_those_of_the_assigner(tmp_path):
     """The returns of binary scores are predicted by the odds, not by their straight line."""
     episodes = list(logged_episodes(200, max_length=8))

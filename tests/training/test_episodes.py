@@ -138,7 +138,7 @@ def test_learn_returns_predicts_first(method):
 
 
 @pytest.mark.parametrize("method", [*map(long_case, ("lare-linear", "lare-bayes")), "lare-rd"])
-@pytest.mark.parametrize("score", ["sum", "average"])
+@pytest.mark.parametrize("score", [long_case("sum"), "average"])
 def test_learn_returns_finds_the_score_type(method, score):
     """The score is the sum or the average of numbers that follow from factors, in 60 episodes of 3 to 12 steps."""
     config, random = small_config(method, capacity=2000, credit=ANY_SCORE), np.random.default_rng(0)

@@ -45,6 +45,7 @@ def episodes():
     return play_episodes(TASK, N_EPISODES)
 
 
+@pytest.mark.long
 def test_r2_of_unseen_returns(episodes):
     assert 0.99 < assess(RIGHT, episodes).r2 <= 1
     assert assess(WRONG, episodes).r2 < 0.3

@@ -135,6 +135,7 @@ def test_resume_is_exact(build, task, changes, stop, phi, request, tmp_path):
     assert_equal_runs(resume_quietly(tmp_path / "run"), expected)
 
 
+@pytest.mark.long
 def test_overlapped_collection_resumes_exactly(small, phi, tmp_path):
     settings = small(scored_observation="both", overlap_collection=True)  # compiled as `factor_run`
     expected = train_quietly(toy_spec(), settings, tmp_path / "complete", phi)
@@ -181,7 +182,7 @@ def test_extend_equals_longer_run(dense, dense_run, tmp_path, monkeypatch):
     assert open_run(run.directory).config == longer.config
 
 
-@pytest.mark.parametrize("anneal", [True, long_case(False)])
+@pytest.mark.parametrize("anneal", [long_case(True), long_case(False)])
 def test_extending_a_run_whose_learning_rate_fell_is_no_long_run(small, tmp_path, anneal):
     """Steps are rounded up, and a message says so."""
     ppo = {"hidden": (8,), "minibatch_size": 20, "epochs": 1, "anneal": anneal}

@@ -40,7 +40,7 @@ def sums_of_payments(values, last):
 @pytest.mark.parametrize(
     ("method", "algorithm", "env", "exact", "payments"),
     [
-        ("rd-linear", "td3", ONE_AGENT, "last", PaymentRule(period=4)),
+        long_case("rd-linear", "td3", ONE_AGENT, "last", PaymentRule(period=4)),
         ("rd", "ippo", TWO_TEAMS, "spread", PAID_AT_END),
         long_case("rd-linear", "td3", ONE_AGENT, "spread", PaymentRule(period=4)),
         long_case("rd-linear", "ippo", TWO_TEAMS, "last", PaymentRule(nonzero=True)),

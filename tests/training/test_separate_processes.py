@@ -29,6 +29,7 @@ def two_cores(monkeypatch):
     monkeypatch.setattr(placement, "n_usable_cores", lambda: 2)
 
 
+@pytest.mark.long
 def test_run_equals_one_in_a_single_process(settings, tmp_path, monkeypatch):
     """Bit for bit, after a stop. Each simulation is started once: the training environment and one for evaluations, of each seed.
 

@@ -32,7 +32,7 @@ def test_episodes_of_each_seed(dense_run, factor_run):
         np.testing.assert_array_equal(episode["observations"], expected["observations"])
 
 
-@pytest.mark.parametrize("payments", [long_case("end"), 2])
+@pytest.mark.parametrize("payments", [long_case("end"), long_case(2)])
 def test_groups(small, tmp_path, payments):
     run = train_quietly(levels_spec(payments=payments), small(method="dense", steps=60, capacity=64), tmp_path / "run")
     by_seed = (lare_rl.stored_episodes(run, seed=seed) for seed in run.seeds)

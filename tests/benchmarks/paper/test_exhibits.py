@@ -68,7 +68,7 @@ def test_exhibits_are_consistent():
     assert (claim.better, claim.than, claim.at_least) == ("LaRe-RRDu, ppo", ("dense, ppo",), True)
 
 
-@pytest.mark.parametrize("budget", ["smoke", "laptop", long_case("paper")])
+@pytest.mark.parametrize("budget", ["smoke", long_case("laptop"), long_case("paper")])
 def test_exhibit_jobs(budget):
     """Settings are valid, recordings exist, runs that share a directory have equal settings, and so have runs in the repository."""
     settings, root = {}, Path(__file__).parents[3] / "benchmarks" / "results" / "reproduce" / budget
