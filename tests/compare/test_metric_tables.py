@@ -5,7 +5,8 @@ import sys
 
 import pytest
 
-from lare_rl.compare.metric_tables import KEYS, write_table
+from lare_rl.compare.metric_tables import KEYS, read_metric_rows, write_table
+from lare_rl.errors import LareError
 
 ROWS = [{"task": "a", "seed": 0, "step": 1, "zeta": 0.5}, {"task": "a", "seed": 0, "step": 2, "alpha": 1.5}]
 
@@ -20,6 +21,18 @@ def test_keys_come_first_and_missing_values_are_empty(tmp_path):
     table = parquet.read_table(parquet_path)
     assert table.column_names == header
     assert [table[name].to_pylist() for name in header[-3:]] == [[1, 2], [None, 1.5], [0.5, None]]
+
+
+def test_damaged_run_is_left_out(make_run):
+    good, bad = make_run("good", [1.0, 2.0]), make_run("bad", [3.0])
+    (bad.directory / "metrics.jsonl").write_bytes(b"\0\0\n" + (bad.directory / "metrics.jsonl").read_bytes())
+    messages = []
+    rows = read_metric_rows([good.directory, bad.directory, good.directory / "none"], messages.append)
+    assert {row["run"] for row in rows} == {"good"}
+    assert len(messages) == 1
+    assert str(bad.directory) in messages[0]
+    with pytest.raises(LareError):
+        read_metric_rows([bad.directory])
 
 
 def test_without_pyarrow_no_old_table_stays(tmp_path, monkeypatch):

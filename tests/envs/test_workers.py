@@ -174,6 +174,29 @@ def test_worker_that_starts_too_late(monkeypatch):
         SubprocVecEnv([ToyHostEnv])
 
 
+class StartsSimulator(ToyHostEnv):
+    """Has a simulator in a process of its own, and hangs in a step."""
+
+    def __init__(self, note):
+        super().__init__("hangs")
+        self.simulator = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+        Path(note).write_text(str(self.simulator.pid))
+
+
+def test_simulator_of_an_environment_ends_with_a_worker_that_hangs(tmp_path):
+    envs = SubprocVecEnv([partial(StartsSimulator, tmp_path / "pid")])
+    envs.timeout = 0.5
+    pid = int((tmp_path / "pid").read_text())
+    assert is_running(pid)
+    with pytest.raises(LareError, match="did not reply"):
+        walk(envs)
+    envs.close()
+    deadline = time.monotonic() + 30
+    while is_running(pid):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
 def test_worker_that_is_killed_between_steps():
     envs = SubprocVecEnv([ToyHostEnv])
     pid = envs.pids[0]

@@ -245,6 +245,10 @@ def test_error_of_a_known_responses_api_is_retried(serve):
         RequestForms().read_answer(b'{"status": "failed", "error": "The model crashed."}')
 
 
+class ShortTimeout(Budget):
+    reply_timeout_s = 0.3
+
+
 def hang(handler):
     threading.Event().wait(30)
 
@@ -269,6 +273,18 @@ def test_slow_answer_ends_with_the_time_of_the_design(start, answer):
     with pytest.raises(BudgetExceededError):
         model.reply(REQUEST, 1)
     assert len(server.requests) == 1
+
+
+def test_slow_model_has_more_time_in_the_next_attempt(start):
+    def answer_late(handler):
+        threading.Event().wait(0.6)
+        reply_with("hello")(handler)
+
+    messages = []
+    _, model, _ = start(answer_late, budget=ShortTimeout(seconds=30), on_message=messages.append)
+    assert model.reply(REQUEST, 0) == "hello"
+    assert ["--minutes" in message for message in messages] == [False, *[True] * (len(messages) - 1)]
+    assert 2 <= len(messages) <= 4
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,9 @@ import lare_rl
 from helpers.scripted_model import ScriptedModel, to_reply
 from helpers.toy_envs import PHI, toy_spec
 from lare_rl.errors import LareError
+from lare_rl.latent.design import DesignError
 from lare_rl.llm.live import LiveModel
-from lare_rl.llm.model import as_model
+from lare_rl.llm.model import as_model, ask
 
 REPLY = to_reply(PHI)
 
@@ -26,16 +27,23 @@ def test_function_is_a_model():
 
 def test_key_and_half_of_surrogate_pair_are_removed(monkeypatch):
     monkeypatch.setenv("OPENAI_API_KEY", "sk-secret-key")
-    assert as_model(lambda messages: "\ud83d").reply([], 0) == "?"
-    assert as_model(lambda messages: "It is sk-secret-key.").reply([], 0) == "It is [key]."
+    assert ask(as_model(lambda messages: "\ud83d"), []) == "?"
+    assert ask(as_model(lambda messages: "It is sk-secret-key."), []) == "It is [key]."
     with pytest.raises(LareError, match=r"KeyError: '\[key\]'"):
-        as_model(lambda messages: {}["sk-secret-key"]).reply([], 0)
+        ask(as_model(lambda messages: {}["sk-secret-key"]), [])
 
 
 @pytest.mark.parametrize("reply", [None, b"text", {"content": "text"}])
 def test_function_must_return_a_text(reply):
     with pytest.raises(LareError, match="must return a text, and returned"):
-        as_model(lambda messages: reply).reply([], 0)
+        ask(as_model(lambda messages: reply), [])
+
+
+def test_replies_survive_any_error_of_a_model():
+    model = ScriptedModel(PHI, error=RuntimeError("server down"))
+    with pytest.raises(DesignError, match="RuntimeError: server down") as error:
+        lare_rl.design(toy_spec(), model=model, candidates=2)
+    assert len(error.value.recorder.exchanges) == 1
 
 
 def test_objects_with_a_name_are_used_as_they_are(monkeypatch):

@@ -67,6 +67,11 @@ def test_fence_in_a_docstring():
     assert parse_reply(json.dumps(GOOD | {"Functions": source})).functions == source
 
 
+def test_fence_with_the_function_is_chosen():
+    functions = "First\n```python\nimport numpy as np\n```\nand then\n```python\ndef evaluation_func(o, a):\n    return [a]\n```"
+    assert parse_reply(json.dumps(GOOD | {"Functions": functions})).functions.startswith("def evaluation_func")
+
+
 JSON = st.recursive(
     st.none() | st.booleans() | st.floats() | st.integers() | st.text(),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from([*GOOD, "More"]) | st.text(), inner),

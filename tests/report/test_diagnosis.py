@@ -172,6 +172,12 @@ def test_next_step_values():
     assert find(FLAT / 100 - 52)["is_stuck"].values["cause"].code == "repeats_behaviour"
 
 
+def test_several_teams_have_no_best_policy():
+    better = np.vstack([FLAT - 50, [[0, 0, 38, 0, 1, 0, 1, 0]]])
+    assert "one_seed_was_better" not in find(better, has_best_policy=False)
+    assert "has_fallen" not in find(FELL, warmup=2999, has_best_policy=False)
+
+
 def test_best_evaluation():
     """It is one of a trained policy. Of an own task, the last evaluations may vary too much to say that the policy fell."""
     lucky = np.array([[90.0, 80, 0, 0, 1, 0, 1, 0]])

@@ -1,3 +1,4 @@
+import json
 import os
 import re
 import shutil
@@ -18,6 +19,7 @@ from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
 from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import load_task
+from lare_rl.errors import LareError
 from lare_rl.evaluation.played_episodes import TeamSample
 from lare_rl.evaluation.video import encode_film
 from lare_rl.report import live_page, run_details
@@ -27,7 +29,8 @@ from lare_rl.report.messages import MESSAGES
 from lare_rl.report.overview import compare_runs, render_learning_curves, sort_runs, summarise_runs
 from lare_rl.report.report import _load_film, default_path
 from lare_rl.report.reported_run import ReportedRun
-from lare_rl.report.run_summary import summarise_run
+from lare_rl.report.run_summary import RunSummary, summarise_run
+from lare_rl.report.score_use import ScoreUse
 from lare_rl.runs.directory import open_without_functions
 from lare_rl.util.findings import Finding
 
@@ -219,6 +222,43 @@ def test_each_team_is_compared_with_its_own_random_returns(tmp_path):
     ]
     assert [first == second for first, second in zip(*charts, strict=True)] == [True, False]
     assert all('class="band c0"' in chart for chart in charts[0])  # as the legend says
+
+
+def test_one_episode_tells_little(make_run):
+    """The return of one episode is as uncertain as that of random actions."""
+    run = make_run("a", [10.0], evaluation_episodes=1)
+    reported = ReportedRun("a", run)
+    for line in reported.metrics:
+        line["evaluation/return_std"] = 0.0
+    random_returns = np.array([0.0, 9.0, -9.0, 4.0, -4.0])
+    summary = summarise_run(reported, random_returns, None)
+    assert summary.episode_error == pytest.approx(random_returns.std(ddof=1))
+    assert not summary.has_learned
+
+
+def test_unknown_gain_of_outcomes_is_no_reason_to_replace_phi():
+    for gain, is_little in ((float("nan"), False), (0.0, True), (0.5, False)):
+        use = ScoreUse(form="form_log_odds", is_binary=True, gain=gain, gain_error=0.1)
+        run = RunSummary(steps=np.arange(2), returns=np.zeros((1, 2)), score_use=use)
+        assert run.explains_little == is_little
+
+
+def test_tasks_of_one_name_are_drawn_separately(make_run, tmp_path):
+    first, second = make_run("a", [1.0]), make_run("b", [1.0])
+    config = json.loads((second.directory / "config.json").read_text())
+    config["task"]["description"] = "Another one."
+    (second.directory / "config.json").write_text(json.dumps(config))
+    with pytest.raises(LareError, match="different tasks with the name Chase"):
+        lare_rl.write_report([first.directory, second.directory], tmp_path / "report.html")
+
+
+def test_damaged_checkpoint_costs_only_what_it_shows(runs, make_run, tmp_path):
+    damaged = tmp_path / "damaged"
+    shutil.copytree(runs[0].directory, damaged)
+    (damaged / "checkpoint" / "state.npz").write_bytes(b"PK")
+    page = page_of(damaged, tmp_path, film=False)
+    assert "no credit and factors to show" in page
+    assert 'class="chart' in page
 
 
 def test_run_without_evaluation(make_run, tmp_path):

@@ -26,7 +26,7 @@ from lare_rl.envs.shared_arrays import SharedArrays, map_arrays, map_current
 from lare_rl.envs.trials import find_interference, time_steps
 from lare_rl.envs.vec_env import Maker, call_env, make_env_at
 from lare_rl.errors import LareError
-from lare_rl.util.processes import own_session
+from lare_rl.util.processes import kill_group, own_session
 
 __all__ = ["Worker", "end_workers", "pickle_maker"]
 
@@ -131,7 +131,10 @@ class Worker:
             self.connection.close()
 
     def kill(self) -> None:
+        """End the process now, with all processes that its environments have started."""
         self.close_connection()
+        if self.process.poll() is None:  # its number could be that of another process afterwards
+            kill_group(self.process.pid)
         self.process.kill()
         self.process.wait()
         assert self.process.stdin is not None
@@ -226,6 +229,7 @@ def _end_with_parent() -> None:
     """Exit when standard input closes, as it does whenever the parent ends, even if a step hangs."""
     while os.read(0, 1):
         pass
+    kill_group(os.getpid())
     os._exit(0)
 
 

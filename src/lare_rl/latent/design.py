@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lare_rl.envs.load import resolve_task
-from lare_rl.errors import LareError, check_count, short_repr
+from lare_rl.errors import LareError, check_count
 from lare_rl.latent.function import LatentFunction, function_from_verdict, normalise_source
 from lare_rl.latent.verify import Check, Steps, Verdict, sample_steps, verify
 from lare_rl.llm import prompts
-from lare_rl.llm.model import Model, ModelFunction, as_model, recorded_model
+from lare_rl.llm.model import Model, ModelFunction, as_model, ask, recorded_model
 from lare_rl.llm.prompts import MAX_ATTEMPTS, MAX_CANDIDATES, N_CANDIDATES, FunctionKind, Message, Stage, check_kind
 from lare_rl.llm.recording import Recorder
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec, require_role
-from lare_rl.util.sanitize import replace_surrogates
 
 __all__ = ["Conversation", "DesignError", "check_recorded", "design", "examine_reply", "keep_replies"]
 
@@ -86,10 +85,7 @@ class Conversation:
 
     def ask(self, stage: Stage, messages: Sequence[Message]) -> str:
         """Return a new reply to a request."""
-        reply = self.model.reply(messages, self.recorder.n_replies(stage, messages))
-        if not isinstance(reply, str):
-            raise LareError(f"the model {self.model.name} must return a text, and returned {short_repr(reply)}")
-        reply = replace_surrogates(reply)
+        reply = ask(self.model, messages, self.recorder.n_replies(stage, messages))
         self.recorder.add(stage, messages, reply, self.model.name)
         return reply
 

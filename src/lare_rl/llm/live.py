@@ -60,6 +60,8 @@ class _Failure(NamedTuple):
     """The pause that the server asks for before the next attempt."""
     request_changed: bool = False
     """Whether the next request has another form. It is sent at once and does not count as an attempt."""
+    timed_out: bool = False
+    """Whether the reply took too long. The next attempt has twice the time."""
 
 
 @dataclass
@@ -126,16 +128,17 @@ class LiveModel:
             BudgetExceededError: the budget does not allow another request, or its time is over.
         """
         self.on_message(f"{self.name}: waiting for a reply, {self.budget.timeout_text()}")
-        attempts, cause = 0, ""
+        attempts, patience, cause = 0, 1, ""
         while True:
             try:
-                result = self._request(messages)
+                result = self._request(messages, min(patience * self.budget.reply_timeout_s, self.budget.seconds_left))
                 if isinstance(result, str):
                     return redact_key(result)
                 cause = f"; the last attempt failed: {result.message}"
                 if result.request_changed:
                     continue
                 attempts += 1
+                patience *= 2 if result.timed_out else 1
                 if not result.retry or attempts == _MAX_ATTEMPTS:
                     raise ModelError(f"{self.name} did not answer: {result.message}")
                 pause_s = result.pause_s or 0.5 * 2 ** (attempts - 1)
@@ -145,20 +148,25 @@ class LiveModel:
             except BudgetExceededError as error:
                 raise BudgetExceededError(f"{error}{cause}") from None
 
-    def _request(self, messages: Sequence[Message]) -> str | _Failure:
+    def _request(self, messages: Sequence[Message], timeout_s: float) -> str | _Failure:
         max_tokens = min(self.forms.reply_tokens, self.budget.max_reply_tokens(messages, MIN_REPLY_TOKENS))
         request = self.forms.request(self.name, messages, max_tokens, self.temperature)
         api = self._client.responses if self.forms.api == "responses" else self._client.chat.completions
 
         def fetch() -> bytes:
-            with api.with_streaming_response.create(**request) as response:
+            with api.with_streaming_response.create(**request, timeout=timeout_s) as response:
                 return read_body(response)
 
         try:
             with self.budget.count_request():
-                body = run_in_time(fetch, self.budget.reply_timeout_s)
+                body = run_in_time(fetch, timeout_s)
         except Exception as error:  # the errors of the HTTP library depend on the client's version
-            return self._failure(error.__cause__ or error, messages, max_tokens)
+            failure = self._failure(error.__cause__ or error, messages, max_tokens)
+            if not failure.timed_out:
+                return failure
+            return failure._replace(
+                message=f"no reply within {timeout_s:.0f} s; more --minutes allow more ({failure.message})"
+            )
         return self._read_answer(body, messages, max_tokens)
 
     def _read_answer(self, body: bytes, messages: Sequence[Message], max_tokens: int) -> str | _Failure:
@@ -203,7 +211,7 @@ class LiveModel:
             self._client.close()
             self._client = self._connect()
         self.budget.count_reply(None, messages, max_tokens)  # the server may have answered
-        return _Failure(_safe_text(f"{name}: {error}"), retry=True)
+        return _Failure(_safe_text(f"{name}: {error}"), retry=True, timed_out="Timeout" in name)
 
     def _refusal(self, error: StatusError) -> _Failure:
         """Handle an HTTP error: change the request, wait, or give up."""

@@ -15,7 +15,7 @@ from lare_rl.llm.recording import RecordedModel, read_recording, shipped_recordi
 from lare_rl.util.safe_io import read_text
 from lare_rl.util.sanitize import replace_surrogates
 
-__all__ = ["FunctionModel", "Model", "ModelFunction", "as_model", "recorded_model"]
+__all__ = ["FunctionModel", "Model", "ModelFunction", "as_model", "ask", "recorded_model"]
 
 
 @runtime_checkable
@@ -47,15 +47,23 @@ class FunctionModel:
     name: str
 
     def reply(self, messages: Sequence[Message], number: int) -> str:
-        try:
-            text = self.function([dict(message) for message in messages])
-        except LareError:
-            raise
-        except Exception as error:
-            raise LareError(redact_key(f"the model {self.name} failed: {type(error).__name__}: {error}")) from error
-        if not isinstance(text, str):
-            raise LareError(f"the model {self.name} must return a text, and returned {short_repr(text)}")
-        return redact_key(replace_surrogates(text))
+        return self.function([dict(message) for message in messages])
+
+
+def ask(model: Model, messages: Sequence[Message], number: int = 0) -> str:
+    """Return a model's reply, which a file can store.
+
+    Raises `LareError` for any error of the model, and if the reply is no text: earlier replies, which were paid for, must not be lost.
+    """
+    try:
+        text: object = model.reply(messages, number)
+    except LareError:
+        raise
+    except Exception as error:
+        raise LareError(redact_key(f"the model {model.name} failed: {type(error).__name__}: {error}")) from error
+    if not isinstance(text, str):
+        raise LareError(f"the model {model.name} must return a text, and returned {short_repr(text)}")
+    return redact_key(replace_surrogates(text))
 
 
 def as_model(model: Any) -> Model:

@@ -63,8 +63,9 @@ def parse_reply(text: str) -> Reply:
         reply = Reply(**values)
     except LareError as error:
         raise MalformedReplyError(f"the reply's JSON object does not have the requested form: {error}") from error
-    fence = _FENCED_BLOCK.search(reply.functions)
-    functions = reply.functions if fence is None or "def " in reply.functions[: fence.start()] else fence[2]
+    fences = list(_FENCED_BLOCK.finditer(reply.functions))
+    fences = [fence for fence in fences if "def " in fence[2]] or fences  # others show what to import, or an example
+    functions = reply.functions if not fences or "def " in reply.functions[: fences[0].start()] else fences[0][2]
     texts = {"understand": reply.understand, "analyze": reply.analyze, "functions": functions}
     for value in texts.values():
         _check_characters(value)

@@ -166,7 +166,8 @@ def describe_flattening(space: gymnasium.Space) -> str:
 def describe_action(space: gymnasium.Space) -> str:
     """Return the encoding or the common bounds of an action, as the end of a sentence about its entries."""
     if isinstance(space, Discrete):
-        return ", all 0 but one: the action that is taken"
+        first = f" (entry 0 is action {space.start})" if space.start else ""
+        return f", all 0 but one: the action that is taken{first}"
     assert isinstance(space, Box)
     lows, highs = set(map(float, space.low.ravel())), set(map(float, space.high.ravel()))
     prefix = "each " if space.shape != (1,) else ""

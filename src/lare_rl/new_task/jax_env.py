@@ -1,8 +1,9 @@
 """Drafts the task file of an environment of another package in JAX: gymnax, Brax, MuJoCo Playground, Jumanji or JaxMARL."""
 
 import inspect
+import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -23,6 +24,8 @@ __all__ = ["draft_jax_task"]
 
 FIELD = re.compile(r"^- (observation|action|reward|episode termination|state)s?:", re.MULTILINE)
 """The start of a section in Jumanji's documentation."""
+MULTI_DISCRETE = re.compile(r"multi.?discrete array of shape", re.IGNORECASE)
+"""The shape of an action in the package, which is another one here."""
 
 
 def draft_jax_task(environment_id: str) -> Draft:
@@ -55,9 +58,18 @@ def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
     documentation = inspect.cleandoc(type(env.env).__doc__ or "")
     sections = split_sections(FIELD.sub(_heading, documentation))
     lines = single_agent_lines(sections)
-    # The mask of available actions is not in the observation.
-    rows = [line for line in lines["observation"] if "action_mask" not in line and not line.startswith("Observation")]
-    return write_texts(lines | {"observation": rows}, sections)
+    rows = [line for line in _without_mask(lines["observation"]) if not line.startswith("Observation")]
+    actions = [line for line in lines["action"] if not MULTI_DISCRETE.match(line)]
+    return write_texts(lines | {"observation": rows, "action": actions}, sections)
+
+
+def _without_mask(lines: list[str]) -> Iterator[str]:
+    """Yield lines without the item about the mask of available actions, which is not in the observation."""
+    in_mask = False
+    for line in lines:
+        in_mask = "action_mask" in line or (in_mask and not line.startswith("- "))
+        if not in_mask:
+            yield line
 
 
 def _heading(match: re.Match[str]) -> str:
@@ -82,5 +94,21 @@ def _describe_observation(env: Any, family: str) -> str:
 
 
 def _describe_action(spec: EnvSpec) -> str:
+    if spec.choice_sizes:
+        return f"{count_entries(spec.action_size)}, all 0 but one: the combination of choices. {_describe_choices(spec.choice_sizes)}"
     space = Discrete(spec.action_size) if spec.discrete else Box(spec.low[0], spec.high[0])
     return f"{count_entries(spec.action_size)}{draft.describe_action(space)}."
+
+
+def _describe_choices(sizes: tuple[int, ...]) -> str:
+    """Return which entry stands for which combination of choices: the last choice changes first."""
+    letters = "abcdefgh"[: len(sizes)]
+    factors = [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
+    entry = " + ".join(
+        f"{factor} {letter}" if factor > 1 else letter for factor, letter in zip(factors, letters, strict=True)
+    )
+    choices = [
+        f"choice {i} is {letter}, from 0 to {n - 1}"
+        for i, (letter, n) in enumerate(zip(letters, sizes, strict=True), 1)
+    ]
+    return f"Entry {entry}: {'; '.join(choices)}."

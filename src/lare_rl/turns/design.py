@@ -11,7 +11,7 @@ from typing import Any
 from lare_rl.errors import LareError
 from lare_rl.latent.design import DesignError, keep_replies
 from lare_rl.latent.function import normalise_source
-from lare_rl.llm.model import Model, ModelFunction, as_model
+from lare_rl.llm.model import Model, ModelFunction, as_model, ask
 from lare_rl.llm.prompts import MAX_ATTEMPTS, Message, correct
 from lare_rl.llm.recording import Recorder
 from lare_rl.llm.reply import parse_reply
@@ -69,7 +69,7 @@ def design_turn_phi(
     problems = ""
     for attempt in range(MAX_ATTEMPTS):
         with keep_replies(recorder, model):
-            reply = model.reply(request, 0)
+            reply = ask(model, request)
         recorder.add("correct" if attempt else "candidate", request, reply, model.name)
         try:
             source = normalise_source(parse_reply(reply).functions)

@@ -1,11 +1,13 @@
 """The cores and the new processes of this program, and locks between processes, on every system."""
 
+import contextlib
 import os
+import signal
 import subprocess
 import sys
 from typing import IO, Any
 
-__all__ = ["n_usable_cores", "own_session", "try_lock", "usable_cores"]
+__all__ = ["kill_group", "n_usable_cores", "own_session", "try_lock", "usable_cores"]
 
 
 def own_session() -> dict[str, Any]:
@@ -13,6 +15,13 @@ def own_session() -> dict[str, Any]:
     if sys.platform == "win32":
         return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
     return {"start_new_session": True}
+
+
+def kill_group(leader: int) -> None:
+    """Kill a process that was started with `own_session`, and all that it has started. Does nothing where there are no groups."""
+    if sys.platform != "win32":
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(leader, signal.SIGKILL)
 
 
 def usable_cores() -> list[int] | None:
