@@ -95,6 +95,12 @@ def test_pictures(environment, sizes, refusal):
             ],
             ["action_mask", "1.0 if a fruit is eaten"],
         ),
+        (
+            "jumanji/Tetris-v0",
+            (),
+            ["Entry 10 a + b: choice 1 is a, from 0 to 3; choice 2 is b, from 0 to 9."],
+            ["discrete array", "Mask of"],
+        ),
     ],
 )
 def test_draft(environment, missing, words, absent):
