@@ -85,3 +85,15 @@ def test_rules_beat_random_actions(name, make):
         if label not in ("no nitrogen", "shortest operation")  # which are no good rules
     }
     assert min(score for label, score in scores.items() if label != "random") > scores["random"]
+
+
+def test_caches_of_trains_do_not_grow(make):
+    """Flatland keeps what it has computed of every map."""
+    from final_score import trains
+
+    env = make("trains")
+    for _ in range(trains.CLEAR_EVERY):
+        env.reset(seed=0)
+    sizes = [cache.cache_info().currsize for cache in trains.flatland_caches()]
+    assert len(sizes) > 5
+    assert 0 < sum(sizes) < 20_000  # of the newest map

@@ -3,6 +3,8 @@
 Flatland (Mohanty et al., 2020). A train is late, or does not arrive at all, because of what another one did much earlier.
 """
 
+import functools
+import gc
 from collections.abc import Callable
 from typing import Any
 
@@ -24,6 +26,8 @@ DIRECTIONS = ("L", "F", "R")
 STOP = 3
 """The action after those of `DIRECTIONS`."""
 FLATLAND_ACTIONS = (1, 2, 3, 4)
+CLEAR_EVERY = 20
+"""Flatland's caches are cleared whenever an environment has played this many episodes."""
 TRAIN_ENTRIES, BRANCH_ENTRIES = 8, 5
 DISTANCE, DETOUR = 50.0, 25.0
 """Distances (cells), times (steps) and detours (cells) are observed divided by these."""
@@ -55,6 +59,7 @@ class Trains(ParallelEnv):
         }
         self.action_spaces = {agent: gymnasium.spaces.Discrete(len(FLATLAND_ACTIONS)) for agent in self.possible_agents}
         self._rail = make_rail()
+        self._n_episodes = 0
         self._random = np.random.default_rng()
 
     def observation_space(self, agent: str) -> gymnasium.Space:
@@ -67,6 +72,10 @@ class Trains(ParallelEnv):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None):
         """Begin on a map. `options={"map": 7}` chooses it."""
+        self._n_episodes += 1
+        if self._n_episodes % CLEAR_EVERY == 0:
+            for cache in flatland_caches():
+                cache.cache_clear()
         if seed is not None:
             self._random = np.random.default_rng(seed)
         map_number = int(self._random.integers(*self._maps))
@@ -194,6 +203,15 @@ def make_rail() -> Any:
         line_generator=sparse_line_generator(),
         obs_builder_object=TreeObsForRailEnv(max_depth=1, predictor=ShortestPathPredictorForRailEnv(20)),
     )
+
+
+@functools.cache
+def flatland_caches() -> tuple[Any, ...]:
+    """Return Flatland's caches of pure functions of a map. They hold up to four million entries each, so memory would grow by 2 MB
+    with every episode.
+    """
+    caches = (item for item in gc.get_objects() if isinstance(item, functools._lru_cache_wrapper))
+    return tuple(cache for cache in caches if str(getattr(cache, "__module__", "")).startswith("flatland."))
 
 
 def parallel_env(**arguments: Any) -> Trains:
