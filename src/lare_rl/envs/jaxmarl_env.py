@@ -110,9 +110,8 @@ class JaxMARLEnv:
         reward = jnp.stack([jnp.asarray(rewards[agent.name], jnp.float32).reshape(()) for agent in agents])
         done = jnp.stack([jnp.asarray(dones[agent.name], bool).reshape(()) for agent in agents])
         ended = jnp.asarray(dones[ALL], bool).reshape(())
-        ended |= ~(state.alive & ~done).any()
-        is_last = ended | (state.steps + 1 >= self.spec.max_steps)
-        alive = state.alive & (is_last | ~done)
+        alive = state.alive & (ended | ~done)
+        ended |= ~alive.any()
         next_state = JaxMARLState(jax_packages.cast_like(env_state, state.env), state.steps + 1, alive)
         return next_state, self._make_timestep(observations, next_state, reward * state.alive, ended, infos)
 
