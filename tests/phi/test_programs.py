@@ -113,6 +113,8 @@ STATEMENTS = [
     "y = np.linalg.norm(x.reshape(-1, 2, 3), ord=1, axis=(2, 1))",
     "y = np.gradient(np.where(x > 1, np.inf, x), axis=1)",
     "y = np.median(np.where(x > -9, np.inf, x), axis=1)",
+    "y = np.interp(x, [0, 90, 180], [1.0, 2.0, 3.0], period=-360)",
+    "y = len(np.poly1d([0, 1, 2]).coeffs) + np.poly1d([0, 0]).coeffs[0]",
     "y = np.modf(np.where(x > 1, np.inf, x))[0]",
     "y = np.vectorize(lambda v: v * 2, otypes=[int])(x)",
     # Types, and objects.

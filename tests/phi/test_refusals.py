@@ -90,6 +90,7 @@ BODIES = {
     "return [observation[:, :len(observation)]]": "E-ROWS line 3: columns",
     "y = observation[:, :2].reshape(len(action) * 2, 1)\nr = np.arange(len(action) * 2).reshape(len(action), 2)[:, ::-1]\n"
     "return [y[r, 0][:, :1]]": "E-ROWS line 5: np.arange(len(x))",
+    "return [np.gradient(observation, np.arange(3.0), axis=1)]": "E-RUN line 3: positions",
     "return [observation[[0, 1]]]": "E-ROWS line 3: x[:, i]",
     "x = np.arange(6)\nx[2:] += 0.5\nreturn [x * action]": "E-RUN line 4: x = x + y",
     "a, *b, c = [1.0]\nreturn [a * action]": "E-RUN line 3: unpacked",

@@ -85,6 +85,8 @@ def _gradient_along_last_axis(f: Array, spacing: Array, edge_order: int) -> Any:
         raise ValueError(f"np.gradient needs at least {edge_order + 1} numbers along its axis")
     x = require_constant(spacing, "the spacing of np.gradient").ravel().astype(float)
     x = np.arange(size) * x[0] if len(x) == 1 else x
+    if len(x) != size:
+        raise ValueError(f"np.gradient of {size} numbers needs one spacing, or {size} positions")
     pieces = [(f[..., 1:2] - f[..., :1]) / (x[1] - x[0])]
     if size > 2:
         d0, d1 = x[1:-1] - x[:-2], x[2:] - x[1:-1]

@@ -114,9 +114,10 @@ def interp(x: Array, xp: Array, fp: Array, left: Any = None, right: Any = None, 
     knots = require_constant(xp, "xp of np.interp").astype(float)
     x = as_numbers(x)
     if period is not None:
-        x %= as_float(period)
-        order = np.argsort(knots % as_float(period), kind="stable")
-        fp, knots = fp[as_array(order)], (knots % as_float(period))[order]
+        period = abs(as_float(period))
+        x %= period
+        order = np.argsort(knots % period, kind="stable")
+        fp, knots = fp[as_array(order)], (knots % period)[order]
         knots = np.concatenate([[knots[-1] - period], knots, [knots[0] + period]])
         fp = fp[as_array([len(order) - 1, *range(len(order)), 0])]
     if len(knots) != fp.row_shape[0] or not (np.diff(knots) >= 0).all():
@@ -212,9 +213,15 @@ def series_value(name: str, x: Array, c: Any, tensor: Any = True) -> Any:
 array_functions(
     {
         "polynomial.Polynomial polynomial.polynomial.Polynomial": lambda coef: Polynomial(coef[::-1], rising=True),
-        "poly1d": lambda c_or_r: Polynomial(c_or_r),
+        "poly1d": lambda c_or_r: Polynomial(_without_leading_zeros(c_or_r)),
     }
 )
+
+
+def _without_leading_zeros(coefficients: Array) -> Array:
+    values = coefficients.constant
+    return coefficients if values is None else as_array(np.poly1d(values).coeffs)
+
 
 # --- sets ---------------------------------------------------------------------------------------------------------------
 
