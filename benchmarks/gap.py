@@ -123,9 +123,9 @@ COMPARISONS = {
     "wheat, SAC": simulator("Wheat", "sac", 6_000),
     "traffic, PPO": simulator("Traffic", "ppo", 36_000, ["episodic"]),
     "job shop, PPO": simulator("JobShop", "ppo", 100_000, ["episodic", "dense"]),
-    # LaRe as published and the proxies are not trained yet.
+    # LaRe as published and the proxy are not trained yet.
     "power grid, PPO": replace(simulator("Grid", "ppo", 30_720), paper=(), dense=()),
-    "trains, IPPO": replace(simulator("Trains", "ippo", 60_000), paper=(), dense=()),
+    "trains, IPPO": simulator("Trains", "ippo", 60_000),
     f"{HALF_CHEETAH}, TD3, short": Comparison(
         30_000,
         [f"{TEN_SEEDS}/episodic"],
