@@ -3,6 +3,7 @@
 import inspect
 import math
 import re
+import string
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -102,7 +103,7 @@ def _describe_action(spec: EnvSpec) -> str:
 
 def _describe_choices(sizes: tuple[int, ...]) -> str:
     """Return which entry stands for which combination of choices: the last choice changes first."""
-    letters = "abcdefgh"[: len(sizes)]
+    letters = string.ascii_lowercase[: len(sizes)]
     factors = [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
     entry = " + ".join(
         f"{factor} {letter}" if factor > 1 else letter for factor, letter in zip(factors, letters, strict=True)
