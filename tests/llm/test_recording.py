@@ -32,6 +32,16 @@ def test_replies():
             model.reply(messages, sample)
 
 
+def test_only_the_line_of_an_error_may_differ():
+    def request(line, words):
+        return [{"role": "user", "content": f"It failed:\nE-COST line {line}: {words}\nCorrect it."}]
+
+    model = recorded_model(exchanges=[EXCHANGE | {"messages": request(27, "too many")}])
+    assert model.reply(request(35, "too many"), 0) == "one"
+    with pytest.raises(LareError, match="no recorded reply"):
+        model.reply(request(27, "too few"), 0)
+
+
 def test_shipped_recordings():
     task = read_task("Reacher-v4")
     for draw in range(5):

@@ -2,6 +2,7 @@
 
 import datetime
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -89,7 +90,10 @@ def read_recording(text: str, name: str) -> Recording:
 
 @dataclass
 class RecordedModel:
-    """Answers requests that match a recorded one word for word, and no other requests."""
+    """Answers requests that match a recorded one word for word, and no other requests.
+
+    Only the line of an error may differ: a later version of the reader may find it more exactly.
+    """
 
     recordings: Sequence[Recording]
     """The recordings to answer from, in this order."""
@@ -100,9 +104,11 @@ class RecordedModel:
 
     def reply(self, messages: Sequence[Message], number: int) -> str:
         """Return a recorded reply to a request. See `Model.reply`."""
-        request = list(messages)
+        request = _without_lines(messages)
         for recording in self.recordings:
-            replies = [reply for x in recording.exchanges if x.messages == request for reply in x.replies]
+            replies = [
+                reply for x in recording.exchanges if _without_lines(x.messages) == request for reply in x.replies
+            ]
             if number < len(replies):
                 self.name = f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"
                 return replies[number]
@@ -113,6 +119,11 @@ class RecordedModel:
             "function of your own (--function phi.py; in a sweep file, the table [functions]), or with a method that needs none "
             "(--method bayes)"
         )
+
+
+def _without_lines(messages: Sequence[Message]) -> list[tuple[str, str]]:
+    """Return role and content of messages, without the numbers of lines."""
+    return [(message["role"], re.sub(r"\bline \d+\b", "line", message["content"])) for message in messages]
 
 
 @dataclass
