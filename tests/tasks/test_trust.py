@@ -117,8 +117,9 @@ def test_report_shows_function_without_import(write_run, foreign_file):
     write_run("foreign_file:X-v0", function_sha256=[read_source(path).digest])
     assert "# 1. how near the action comes" in write_report([path.parent]).read_text(encoding="utf-8")
     path.write_text(PHI.replace("near", "far"))
-    with pytest.raises(LareError, match="its hash changed"):
-        write_report([path.parent])
+    page = write_report([path.parent]).read_text(encoding="utf-8")
+    assert "its hash changed" in page
+    assert "how far the action comes" not in page
     path.unlink()  # as in published results
     assert "of the module foreign_file" in write_report([path.parent]).read_text(encoding="utf-8")
 
