@@ -189,9 +189,8 @@ def check_config(config: AssignerConfig) -> None:
             raise LareError(f"{name} needs a phi; bayes, rd and rrdu need none")
     elif not method.needs_phi:
         raise LareError(f"{name} needs no phi: leave it out, or use lare-bayes")
-    elif (
-        method.phi_kind != "reward" and phi.kind != method.phi_kind
-    ):  # a reward that was written by hand does not name its kind
+    elif method.phi_kind != "reward" and phi.kind != method.phi_kind:
+        # A reward that was written by hand does not name its kind.
         raise LareError(f"{name} needs a phi of the kind {method.phi_kind!r}, and this one is of the kind {phi.kind!r}")
     elif config.task is None:
         raise LareError("a phi needs the task that it was designed for: CreditAssigner(..., phi, task=task)")

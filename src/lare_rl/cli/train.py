@@ -110,7 +110,7 @@ def _prepare(
     spec = resolve_task(task)
     resolved = resolve(settings, spec)
     for name, warning in describe_unused_settings(settings, resolved, spec).items():
-        # A repeated run lists all of its settings. The user did not write those that make no difference.
+        # The configuration of a repeated run holds every setting, so a setting without effect is no mistake of the user.
         if not (plan.is_run and plan.has_same_value(name, settings)):
             raise LareError(f"{warning}: leave the setting out")
     files = function or plan.function_for(resolved)

@@ -342,13 +342,13 @@ def rearrange(function: Callable[..., Any], arrays: Any, *args: Any) -> Any:
     builder.spend(builder.check_size([sum(sizes)]))
     if len(inputs) == 1:
         base = inputs[0].base
-        nodes, sources, size = [base.node], [inputs[0].source], label_size(base) - 1
+        nodes, sources, size = [base.node], [inputs[0].source], label_size(base)
     else:
-        starts, size = itertools.accumulate(sizes, initial=0), sum(sizes)
+        starts, size = itertools.accumulate(sizes, initial=0), sum(sizes) + 1
         nodes = [array.node for array in inputs]
         sources = [Source(all_positions(x.row_shape) + i, x.batch_axis) for x, i in zip(inputs, starts, strict=False)]
     remaining = iter(sources)
-    moved = move(function, map_leaves(lambda _: next(remaining), arrays), args, size + 1)
+    moved = move(function, map_leaves(lambda _: next(remaining), arrays), args, size)
 
     def to_array(source: Source) -> Array:
         positions, batch_axis, _ = source
@@ -356,7 +356,7 @@ def rearrange(function: Callable[..., Any], arrays: Any, *args: Any) -> Any:
         if len(inputs) == 1 and not has_zeros:
             return inputs[0].moved(source)
         zeros = [builder.cast(builder.constant(0), widest([builder.nodes[i].kind for i in nodes]))] if has_zeros else []
-        return Array(builder.gather(builder.concat([*nodes, *zeros]), positions % (size + 1)), batch_axis)
+        return Array(builder.gather(builder.concat([*nodes, *zeros]), positions % size), batch_axis)
 
     if isinstance(moved, Source):
         return to_array(moved)

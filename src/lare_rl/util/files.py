@@ -91,9 +91,8 @@ def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
 
     Raises `LareError` if the file cannot be written.
     """
-    if (
-        path.exists() and not path.is_file() and not path.is_dir()
-    ):  # a device, such as /dev/null, or a pipe is never replaced
+    if path.exists() and not path.is_file() and not path.is_dir():
+        # A device, such as /dev/null, or a pipe is never replaced.
         with report_write_error(path), path.open("wb") as file:
             write(file)
         return
