@@ -82,7 +82,7 @@ def test_bad_cross_play(runs, make_run):
         ((chase, chase), "two teams that learn, and Chase has 1$"),
         ((chase, runs[0]), "these are of Chase and CompetitivePP-6$"),
         ((runs[0], other_algorithm), "algorithm, and these are of ippo and other$"),
-        ((runs[0], other_task), "different tasks named CompetitivePP-6$"),
+        ((runs[0], other_task), "different tasks with the name CompetitivePP-6:"),
     ]:
         with pytest.raises(LareError, match=message):
             cross_play(pair)

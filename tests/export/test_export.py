@@ -197,7 +197,7 @@ def policy_case(config, actor):
     )
     if memory:
         expected["next_hidden"] = memory.hidden[0]
-    if env.discrete and not config.deterministic_evaluation:
+    if env.discrete and config.algorithm.name in ("ppo", "ippo"):
         rows = policy_input(jnp.asarray(observation)[None], config)
         expected["logits"] = np.asarray(jax.vmap(ppo.logits)(actor, rows, available[None]))[0]
     action = np.asarray(action)[0]

@@ -133,6 +133,36 @@ def test_dict_space():
     np.testing.assert_array_equal([credit.recorded[t][0, 14:23] for t in range(1, 6)], np.eye(9)[1:6])
 
 
+def test_box_without_an_axis():
+    box = spaces.Box(-9, 9, ())
+    team = LoggedTeam(NAMES[:2], observations=dict.fromkeys(NAMES[:2], box), actions=dict.fromkeys(NAMES[:2], box))
+    team.observe = lambda agent: np.array(team.steps, np.float32)
+    credit = make_assigner(agents=2, observation_space=box, action_space=box)
+    wrapped = CreditParallel(team, credit)
+    wrapped.reset(seed=0)
+    wrapped.step(dict.fromkeys(NAMES[:2], np.array(7, np.float32)))
+    np.testing.assert_array_equal(credit.recorded[0][:, :3], [[0, 7, 1]] * 2)
+
+
+def test_agents_that_are_listed_after_they_left():
+    class Listed(LoggedTeam):
+        def step(self, actions):
+            self.agents = list(actions)
+            result = super().step(actions)
+            self.agents = list(NAMES)
+            return result
+
+    credit = make_assigner()
+    wrapped = CreditParallel(Listed(NAMES, leaves={"a_1": 2}), credit)
+    wrapped.reset(seed=3)
+    for acting in [NAMES] * 2 + [("a_0", "a_2")] * 3:
+        wrapped.step(dict.fromkeys(acting, 0))
+    assert credit.store.n_ended == 1
+    assert credit.store.alive[:5, 1].tolist() == [True, True, False, False, False]
+    with pytest.raises(LareError, match="call reset"):
+        wrapped.step({})
+
+
 def test_checker_of_pettingzoo(recwarn):
     parallel_api_test(CreditParallel(LoggedTeam(NAMES), make_assigner()), num_cycles=20)
     recwarn.clear()

@@ -46,6 +46,7 @@ def refusal(read, *arguments) -> str:
         (b'{"format": ' + b"9" * 5000 + b"}", "5,000 digits"),
         (f'{{"format": {FORMAT}}}'.encode(), "'lare', 'settings', 'task'"),
         (b'{"format": 1, "lare": "0.1"}', "another version of LaRe (0.1)"),
+        (b'{"lare": "0.1"}', "no 'format'"),
         (b"x" * (MAX_CONFIG_BYTES + 1), "is larger than 8 MB"),
     ],
 )

@@ -7,7 +7,6 @@ The *score of a run* is the value of the metric at an evaluation. If there are s
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +16,7 @@ from lare_rl.compare.results import LearningCurve, group_pairs
 from lare_rl.errors import LareError
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
+from lare_rl.tasks.spec import check_same_tasks
 
 __all__ = ["LAST_RETURN", "LabelScores", "ScoreChoice", "group_results", "has_common_scale", "last_quarter"]
 
@@ -67,7 +67,9 @@ def group_results(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_R
     if not results:
         raise LareError("there are no results to compare")
     tasks = tuple(sorted({curve.task for curve in results}))
-    _check_tasks(results, tasks, choice.metric)
+    if not has_common_scale(tasks, choice.metric):
+        raise LareError(f"{choice.metric} has no common scale over {', '.join(tasks)}: compare each task alone")
+    check_same_tasks((curve.source, curve.config.task) for curve in results if curve.config is not None)
     curves = _index_curves(results, choice.metric)
     steps = _shared_steps(curves, choice)
     n_final = len(last_quarter(steps)) if choice.average_last_quarter else 1
@@ -124,20 +126,6 @@ def last_quarter(steps: Sequence[int]) -> list[int]:
 def has_common_scale(tasks: Collection[str], metric: str) -> bool:
     """Return whether the scores of some tasks can be averaged: those of one task, or returns that can be scaled."""
     return len(tasks) == 1 or (metric == RETURN and all(task in REFERENCE_RETURNS for task in tasks))
-
-
-def _check_tasks(results: Sequence[LearningCurve], tasks: Sequence[str], metric: str) -> None:
-    """Raise `LareError` if scores of several tasks have no common scale, or two tasks have the same name."""
-    if not has_common_scale(tasks, metric):
-        raise LareError(f"{metric} has no common scale over {', '.join(tasks)}: compare each task alone")
-    sources: dict[str, tuple[Path, str]] = {}  # the first source of each task, and the task's digest
-    for curve in results:
-        if curve.config is not None:
-            source, digest = sources.setdefault(curve.task, (curve.source, curve.config.task.digest))
-            if digest != curve.config.task.digest:
-                raise LareError(
-                    f"{curve.source} and {source} have different tasks with the name {curve.task}: compare them separately"
-                )
 
 
 def _index_curves(results: Sequence[LearningCurve], metric: str) -> dict[_CurveKey, LearningCurve]:

@@ -1,7 +1,8 @@
 """Read config.json of earlier versions.
 
-When a setting gets another name or meaning, `FORMAT` is increased, and a new row of `_MIGRATIONS` converts the old form. So reports
-and comparisons of old runs are still possible. Their checkpoints are read by `util/renamed_fields.py`, if only names differ.
+`FORMAT` is increased if a setting is renamed or removed, if it changes its meaning, or if the default of a new setting is wrong for old
+runs. A new row of `_MIGRATIONS` converts the old form. So reports and comparisons of old runs are still possible. Their checkpoints are
+read by `util/renamed_fields.py`, if only names differ.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,7 +17,7 @@ CONFIG = "config.json"
 """The configuration of a run, in its directory."""
 
 FORMAT = 9
-"""The format of config.json. It is increased whenever its contents change."""
+"""The format of config.json."""
 
 Values = dict[str, Any]
 Migration = Callable[[Values], Values]
@@ -28,6 +29,8 @@ def migrate(values: Values) -> Values:
     while isinstance(number, int) and number in _MIGRATIONS:
         values = _MIGRATIONS[number](values) | {"format": number + 1}
         number += 1
+    if number is None:
+        raise LareError("it has no 'format': it is not a file of LaRe, or it is damaged")
     if number != FORMAT:
         raise LareError(
             f"the run is of another version of LaRe ({values.get('lare', 'unknown')}): use that version, or train it again"
@@ -36,11 +39,11 @@ def migrate(values: Values) -> Values:
 
 
 def _change_table(name: str, change: Migration) -> Migration:
-    """Return a function that changes one table. What is no table, in a damaged file, stays."""
+    """Return a function that changes one table. A value that is not a table, in a damaged file, is left for the checks of `Config`."""
 
     def migration(values: Values) -> Values:
         table = values.get(name)
-        return values | {name: change(table)} if isinstance(table, dict) else values
+        return (values | {name: change(table)}) if isinstance(table, dict) else values
 
     return migration
 
@@ -59,8 +62,9 @@ _MIGRATIONS: Mapping[int, Migration] = {
     # `reflect_every` replaced phi during a run. The oldest runs have no `first_fit`.
     4: _change_table("settings", lambda table: {"first_fit": "published"} | _without(table, "reflect_every")),
     5: rename_keys,  # keys of settings and tasks got other names
-    6: _change_credit(lambda credit: {"exact": "no"} | credit),  # none were exact
-    7: _change_credit(lambda credit: _without(credit, "optimism")),  # it did not help
-    8: _change_credit(lambda credit: {"start_value": False} | credit),  # no sum had one
+    # Settings that did not exist yet get the value that old runs behaved by, unless the file has one.
+    6: _change_credit(lambda credit: {"exact": "no"} | credit),
+    7: _change_credit(lambda credit: _without(credit, "optimism")),  # removed, because it did not help
+    8: _change_credit(lambda credit: {"start_value": False} | credit),
 }
 """Functions that convert a format to the next one."""

@@ -14,6 +14,7 @@ from lare_rl.envs.interface import JaxEnv, Team, team_mean
 from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError, check_count
 from lare_rl.runs.directory import Run
+from lare_rl.tasks.spec import check_same_tasks
 from lare_rl.training.collect_device import make_jax_env, unroll_on_device
 from lare_rl.training.policy import make_policy
 from lare_rl.training.saved_state import load_actor
@@ -40,8 +41,7 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
     algorithm, other_algorithm = (run.config.settings.algorithm for run in runs)
     if task.name != other_task.name:
         raise LareError(f"cross-play needs two runs of one task, and these are of {task.name} and {other_task.name}")
-    if task.digest != other_task.digest:
-        raise LareError(f"cross-play needs two runs of one task, and these have different tasks named {task.name}")
+    check_same_tasks((run.directory, run.config.task) for run in runs)
     if len(task.teams) != 2:
         raise LareError(f"cross-play needs two teams that learn, and {task.name} has {len(task.teams) or 1}")
     if algorithm != other_algorithm:

@@ -2,9 +2,10 @@
 
     observation [batch *agents observation]  ->  action [batch *agents action], or the number of a choice [batch *agents]
 
-PPO and IPPO also return the `logits` of choices, (batch, *agents, choices), from which choices can be sampled. Only tasks of many
-agents have the axis `*agents`. QMIX and VDN have a memory: they also take `hidden` (zeros at the first step, then the last
-`next_hidden`) and `last_action` (one more than the largest action at the first step, then the last `action`).
+PPO and IPPO also return the `logits` of choices, (batch, *agents, choices), from which choices can be sampled: the most likely choice
+can earn far less than samples. Only tasks of many agents have the axis `*agents`. QMIX and VDN have a memory: they also take `hidden`
+(zeros at the first step, then the last `next_hidden`) and `last_action` (one more than the largest action at the first step, then the
+last `action`).
 """
 
 from functools import partial
@@ -49,11 +50,13 @@ def policy_graph(actor: Any, config: TrainConfig) -> Graph:
 def _act(inputs: dict[str, Array], actor: Any, config: TrainConfig) -> dict[str, Array]:
     """Return the outputs of the policy for one row of inputs."""
     env, algorithm = config.env, config.algorithm.load()
-    inputs = inputs if env.n_agents > 1 else {name: values[None] for name, values in inputs.items()}
+    if env.n_agents == 1:  # networks always have an axis of agents
+        inputs = {name: values[None] for name, values in inputs.items()}
     observation = inputs["observation"]
     available = inputs.get("available", jnp.ones((env.n_agents, env.action_size), bool))
     memory = policy.init_memory(config)
     if memory:
+        # The number of no choice, at the first step, becomes zeros.
         last_action = jax.nn.one_hot(inputs["last_action"] - env.first_choice, env.action_size)
         memory = memory._replace(hidden=inputs["hidden"], last_action=last_action)
     action, next_memory = policy.act(actor, memory, observation, available, None, config)
@@ -62,7 +65,7 @@ def _act(inputs: dict[str, Array], actor: Any, config: TrainConfig) -> dict[str,
         outputs["action"] = to_env_action(action, env)
     else:
         outputs["action"] = jnp.argmax(action, axis=-1) + env.first_choice
-        if not config.deterministic_evaluation and hasattr(algorithm, "logits"):
+        if hasattr(algorithm, "logits"):
             choices = available if env.masks_actions else None
             outputs["logits"] = algorithm.logits(actor, policy.policy_input(observation, config), choices)
     return outputs if env.n_agents > 1 else {name: values[0] for name, values in outputs.items()}

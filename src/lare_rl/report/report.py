@@ -28,6 +28,7 @@ from lare_rl.report.run_details import describe_method, render_details, render_s
 from lare_rl.report.run_summary import RunSummary
 from lare_rl.runs.checkpoint import STATE_FILE
 from lare_rl.runs.directory import Run, as_run, find_run_directories, open_run, open_without_functions
+from lare_rl.tasks.spec import check_same_tasks
 from lare_rl.tasks.trust import untrusted_module
 from lare_rl.util.files import check_new_path, write_bytes
 from lare_rl.util.provenance import code_version
@@ -116,7 +117,7 @@ def _render_body(reported_runs: Sequence[ReportedRun], film: bool) -> Iterable[s
 
 def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
     """Yield the sections on runs of a task."""
-    _check_same_task(runs)
+    check_same_tasks((reported.run.directory, reported.run.config.task) for reported in runs)
     task = runs[0].run.config.task
     n_random = max(n_random_episodes(reported.last_step, reported.run.config.longest_episode) for reported in runs)
     random_returns = measure_random_returns(task, n_random)
@@ -156,17 +157,6 @@ def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
         verdict = render_verdict(reported, summary, has_title=False)
         yield render_fold(title, [*verdict, render_note(describe_method(reported.run)), *details])
     yield _note_missing(runs)
-
-
-def _check_same_task(runs: Sequence[ReportedRun]) -> None:
-    """Raise `LareError` if two runs have different tasks of the same name."""
-    first = runs[0].run
-    for reported in runs:
-        if reported.run.config.task.digest != first.config.task.digest:
-            raise LareError(
-                f"{first.directory} and {reported.run.directory} have different tasks with the name {first.config.task.name}: draw "
-                "them separately"
-            )
 
 
 def _render_details(

@@ -3,7 +3,8 @@
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, StrictInt, field_validator, model_validator
@@ -21,6 +22,7 @@ __all__ = [
     "ScoredObservation",
     "TaskSpec",
     "base_name",
+    "check_same_tasks",
     "entry_meanings",
     "names_by_side",
     "require_role",
@@ -272,6 +274,15 @@ def _tuples_to_lists(value: Any) -> Any:
 def unwritten_texts(task: TaskSpec) -> list[str]:
     """Return the keys of the texts that still have the placeholder of a draft."""
     return [key for key in ("description", "observation", "action") if FILL_IN in getattr(task, key)]
+
+
+def check_same_tasks(tasks: Iterable[tuple[Path, TaskSpec]]) -> None:
+    """Raise `LareError` if two paths have different tasks of the same name."""
+    first: dict[str, tuple[Path, str]] = {}
+    for path, task in tasks:
+        other, digest = first.setdefault(task.name, (path, task.digest))
+        if digest != task.digest:
+            raise LareError(f"{path} and {other} have different tasks with the name {task.name}: show them separately")
 
 
 def require_role(task: TaskSpec) -> TaskSpec:
