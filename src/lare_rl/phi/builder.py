@@ -5,6 +5,7 @@ An operation on constants alone is computed at once, in float64.
 
 import math
 import string
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -44,7 +45,8 @@ class Builder:
         self.nodes: list[Node] = []
         self.line = 0
         """Line of the source that is being read."""
-        self.work = 0
+        self.work: Counter[int] = Counter()
+        """Work of each line."""
         self._depths: list[int] = []
         self._indices: dict[Any, int] = {}
         self._operations = 0
@@ -70,7 +72,8 @@ class Builder:
             self._operations += bool(inputs)
             if self._operations > self.limits.operations or depth > self.limits.depth:
                 most = f"{self.limits.operations} operations, {self.limits.depth} of them one after the other"
-                raise RefusedError("E-COST", f"the program has too many operations: at most {most}")
+                lines = _largest_lines(Counter(node.line for node in self.nodes if node.inputs))
+                raise RefusedError("E-COST", f"the program has too many operations: at most {most}; {lines}")
             self._indices[key] = len(self.nodes)
             self._depths.append(depth)
             self.nodes.append(Node(op, tuple(inputs), shape, kind, option, self.line))
@@ -94,9 +97,10 @@ class Builder:
 
     def spend(self, numbers: int) -> None:
         """Count the work of an operation. The limit lets every program be read within about a second."""
-        self.work += OPERATION_COST + numbers
-        if self.work > self.limits.work:
-            raise RefusedError("E-COST", "the program computes too much for one row")
+        self.work[self.line] += OPERATION_COST + numbers
+        if self.work.total() > self.limits.work:
+            most = f"at most {self.limits.work}; {_largest_lines(self.work)}"
+            raise RefusedError("E-COST", f"the program computes too many numbers for each row: {most}")
 
     def input(self, name: str, shape: tuple[int, ...], kind: NumberKind = "float") -> int:
         """Add an array of the caller."""
@@ -249,9 +253,17 @@ class Builder:
             nodes.append(node._replace(inputs=inputs, option=option))
         graph = Graph(tuple(nodes), {name: new_index[i] for name, i in outputs.items()})
         if graph.size > self.limits.numbers:
-            most = f"at most {self.limits.numbers} are accepted"
+            numbers: Counter[int] = Counter()
+            for node in graph.operations:
+                numbers[node.line] += graph.cost(node)
+            most = f"at most {self.limits.numbers} are accepted; {_largest_lines(numbers)}"
             raise RefusedError("E-COST", f"the factors need {graph.size} numbers for each row: {most}")
         return graph
+
+
+def _largest_lines(costs: Counter[int]) -> str:
+    """Name the lines of a program that cost most."""
+    return "most in " + ", ".join(f"line {line} ({cost})" for line, cost in costs.most_common(3))
 
 
 def _find_box(positions: np.ndarray, shape: tuple[int, ...]) -> Gather:

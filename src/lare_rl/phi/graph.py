@@ -80,10 +80,11 @@ class Graph:
 
     @property
     def size(self) -> int:
-        """How many numbers the operations compute for each row. A product of arrays counts all its terms."""
-        return sum(self._cost(node) for node in self.operations)
+        """How many numbers the operations compute for each row."""
+        return sum(self.cost(node) for node in self.operations)
 
-    def _cost(self, node: Node) -> int:
+    def cost(self, node: Node) -> int:
+        """Return how many numbers an operation computes for each row. A product of arrays counts all its terms."""
         if node.op != "einsum":
             return math.prod(node.shape)
         terms = node.option.partition("->")[0].replace("...", "").split(",")

@@ -180,7 +180,8 @@ def _build_graph(interpreter: Interpreter, observation_size: int, action_size: i
         for array in arrays:
             array.read_only = True
         outputs.append(_check_factors(interpreter.call(function, arrays, {}), max_factors))
-        interpreter.meter, builder.work = Meter(), 0
+        interpreter.meter = Meter()
+        builder.work.clear()
     if outputs[0] != outputs[1]:
         text = "a second call gives other factors: keep nothing in module variables, defaults or closures"
         raise RefusedError("E-STATE", text)
