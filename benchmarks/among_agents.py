@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import JaxEnv
-from lare_rl.evaluation.played_episodes import compute_training_rewards, unroll_policy
+from lare_rl.evaluation.played_episodes import compute_proxy_rewards, unroll_policy
 from lare_rl.runs.directory import Run, open_run
 from lare_rl.training.decoder_inputs import compute_host_factors
 from lare_rl.training.saved_state import load_learner
@@ -35,7 +35,7 @@ def true_and_proxy_rewards(run: Run, seed_index: int) -> tuple[Rewards, Rewards]
     config, learner = state.config, state.learner
     actor = jax.tree.map(lambda leaf: leaf[seed_index : seed_index + 1], state.actor)
     steps = unroll_policy(env, config, actor, EPISODES, KEY).steps
-    proxy = compute_training_rewards(
+    proxy = compute_proxy_rewards(
         select_seed(learner, seed_index), steps, compute_host_factors(run, config, steps), config
     )
     return steps.next_timestep.reward.swapaxes(0, 1), proxy.swapaxes(0, 1)

@@ -49,7 +49,7 @@ def main(run: tyro.conf.Positional[Path], out: Path = PICTURE) -> None:
     """
     played = play_run(open_run(run), N_EPISODES)
     episode = int(np.argsort((played.reward.sum(axis=2) * played.mask).sum(axis=0))[N_EPISODES // 2])
-    reward, proxy = played.select_episode((played.reward, played.training_reward), episode)
+    reward, proxy = played.select_episode((played.reward, played.proxy_reward), episode)
     assert proxy is not None
     n_steps, n_agents = reward.shape
     scale = np.percentile(np.stack([reward, proxy]), [2, 98])

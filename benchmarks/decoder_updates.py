@@ -21,7 +21,7 @@ from lare_rl.credit.methods import METHODS
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.particles.particle_env import ParticleEnv
 from lare_rl.envs.particles.task import MAX_STEPS
-from lare_rl.evaluation.played_episodes import compute_training_rewards, unroll_policy
+from lare_rl.evaluation.played_episodes import compute_proxy_rewards, unroll_policy
 from lare_rl.training import learner as learner_module
 from lare_rl.training.compiled import compile_functions
 from lare_rl.training.decoder_fits import fit_repeatedly
@@ -69,7 +69,7 @@ def random_episodes(key: int, count: int, config: TrainConfig) -> Trajectory:
 
 def correlations(learner: Learner, steps: Trajectory, config: TrainConfig) -> tuple[float, float]:
     """Correlation within an episode, and of returns."""
-    r_hat = compute_training_rewards(learner, steps, no_factors(TEST_EPISODES), config)
+    r_hat = compute_proxy_rewards(learner, steps, no_factors(TEST_EPISODES), config)
     true_reward, proxy_reward = (
         rewards.swapaxes(0, 1).mean(2) for rewards in (np.asarray(steps.next_timestep.reward), r_hat)
     )

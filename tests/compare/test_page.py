@@ -8,7 +8,7 @@ from lare_rl.compare.collect import select_runs
 from lare_rl.compare.comparison import compare
 from lare_rl.compare.labels import label_runs
 from lare_rl.compare.messages import MESSAGES, find_min_p, find_score_meaning, find_small_samples, to_text
-from lare_rl.compare.page import comparison_table, describe, overall_table, write_comparisons
+from lare_rl.compare.page import comparison_table, describe, write_comparisons
 from lare_rl.compare.results import read_run_results
 from lare_rl.errors import LareError
 from lare_rl.runs.metric_names import RETURN
@@ -24,7 +24,7 @@ def codes(findings):
 
 def test_page_of_several_tasks(make_run, tmp_path):
     runs = [make_run("a", [-44.0, -2.7], "Reacher-v4"), make_run("b", [4600.0, 4600.0], "Walker2d-v4")]
-    (comparison,) = write_comparisons(read(runs), tmp_path / "page.html")
+    (comparison,), _ = write_comparisons(read(runs), tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
     assert "Reacher-v4 (0 is -44, 1 is -2.7), Walker2d-v4 (0 is 3.4, 1 is 4600)" in page
     assert page.count("<svg") == 2
@@ -41,12 +41,14 @@ def test_page_of_tasks_without_common_scale(make_run, tmp_path):
         for task in ("Chase", "Depot")
         for name, values, method in (("a", low, "dense"), ("b", high, "rd"))
     ]
-    comparisons = write_comparisons(read(runs), tmp_path / "page.html")
-    assert overall_table(comparisons) == [("dense (baseline)", "3", "-", "-"), ("rd", "3", "1.000", "0.005")]
+    _, overall = write_comparisons(read(runs), tmp_path / "page.html")
+    assert overall == [("dense (baseline)", "3", "-", "-"), ("rd", "3", "1.000", "0.005")]
     page = (tmp_path / "page.html").read_text()
     assert re.findall("<h2>(.*?)</h2>", page) == ["Chase", "Depot", "All tasks"]
     write_comparisons(read([runs[0], runs[3]]), tmp_path / "page.html")
-    assert "All tasks" not in (tmp_path / "page.html").read_text()
+    page = (tmp_path / "page.html").read_text()
+    assert "All tasks" not in page
+    assert MESSAGES["no_overall_table"] in page
 
 
 def test_command(make_run, command, tmp_path):

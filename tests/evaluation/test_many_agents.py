@@ -41,8 +41,8 @@ def runs(tmp_path_factory, small_many):
 def test_rollout(runs):
     played = play_run(runs[0])
     assert played.state.world.position.shape == (25, 1, 11, 2)
-    assert played.reward.shape == played.training_reward.shape == played.credit.shape == (25, 1, 8)
-    assert played.training_reward.std() > 0
+    assert played.reward.shape == played.proxy_reward.shape == played.credit.shape == (25, 1, 8)
+    assert played.proxy_reward.std() > 0
     assert played.select_episode(played.reward).shape == (25, 8)
     assert [frame.shape for frame in record_frames(runs[0], played=played)[0]] == [(400, 400, 3)] * 25
 

@@ -12,7 +12,7 @@ from helpers.small_configs import SMALL_SETTINGS, add_steps, random_steps
 from lare_rl.config.resolve import resolve
 from lare_rl.errors import LareError
 from lare_rl.evaluation import played_episodes as module
-from lare_rl.evaluation.played_episodes import compute_training_rewards, play_run, sample_steps, unroll_policy
+from lare_rl.evaluation.played_episodes import compute_proxy_rewards, play_run, sample_steps, unroll_policy
 from lare_rl.runs.directory import create_run
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
@@ -47,7 +47,7 @@ def run(tmp_path_factory):
 def no_rewards():
     """Leave out the training rewards, which take seconds to compile."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "compute_training_rewards", lambda *_: None)
+        patch.setattr(module, "compute_proxy_rewards", lambda *_: None)
         yield
 
 
@@ -100,7 +100,7 @@ def test_exact_rewards_add_up_to_payments(run, played):
     state = load_learner(run)
     steps = random_steps(state.config.env, envs=2, lengths=(6, 4, 5, 6, 3, 6))
     learner = add_steps(select_seed(state.learner), state.config, steps)
-    rewards = compute_training_rewards(learner, played.steps, played.factors, state.config)
+    rewards = compute_proxy_rewards(learner, played.steps, played.factors, state.config)
     sums, payments = [], []
     for episode in range(N_EPISODES):
         values = np.asarray(played.steps.timestep.alive), played.reward, rewards
@@ -109,8 +109,7 @@ def test_exact_rewards_add_up_to_payments(run, played):
             team_reward = (rewards_ * alive).sum(axis=1) / alive.sum(axis=1)
             total += [team_reward[start : start + 2].sum() for start in range(0, len(true), 2)]
     assert np.std(payments) > 0.1
-    scale = np.dot(sums, payments) / np.dot(payments, payments)  # rewards are divided by their deviation
-    np.testing.assert_allclose(sums, scale * np.array(payments), atol=1e-4)
+    np.testing.assert_allclose(sums, payments, atol=1e-4)
 
 
 def test_sampled_reward_of_a_team_is_the_mean_over_agents_that_are_alive(run, played, monkeypatch):
@@ -120,6 +119,8 @@ def test_sampled_reward_of_a_team_is_the_mean_over_agents_that_are_alive(run, pl
     expected = (played.reward * alive).sum(axis=-1) / alive.sum(axis=-1)
     assert not alive[played.mask].all()
     np.testing.assert_allclose(sample.reward.ravel(), expected[played.mask], rtol=1e-6)
+    assert sample.has_step_rewards
+    assert np.isnan(replace(sample, has_step_rewards=False).correlations).all()
 
 
 def test_an_episode_does_not_depend_on_the_number_of_environments(run, played, monkeypatch):

@@ -310,9 +310,9 @@ class CreditAssigner:
         with self.lock:
             self.learner.learn_if_due()
             decoder = self.learner.decoder
-            if not (decoder.is_average | decoder.is_log_odds):
-                return "sum"
-            return "average" if bool(decoder.is_average) else "log odds"
+            if np.asarray(decoder.is_average):
+                return "average"
+            return "log odds" if np.asarray(decoder.is_log_odds) else "sum"
 
     form = score_type  # the earlier name
 

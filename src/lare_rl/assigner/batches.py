@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int
 
 from lare_rl.assigner import compiled_functions as compiled
-from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS
+from lare_rl.assigner.compiled_functions import MAX_CALL_STEPS
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.descent import plan_batch
@@ -43,7 +43,7 @@ def whole_episodes(store: Store, spec: CreditSpec, episodes: Sequence[StoredEpis
     longest = int(lengths.max(initial=1))
     rows = padded_size(longest)
     if lengths.sum() > rows:
-        rows = padded_size(max(longest, min(MAX_CALL_ROWS // spec.agents, spec.window * longest)))
+        rows = padded_size(max(longest, min(MAX_CALL_STEPS // spec.agents, spec.window * longest)))
     return pack_in_order(store, episodes, spec.window, rows)
 
 

@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.extend.backend import get_backend
 from jaxtyping import Array, Float, Key
 
 from lare_rl.credit import closed_form, decoder_state, descent, explanation, learning, rewards
@@ -14,9 +15,10 @@ from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.rewards import StepBatch
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.data import layouts
+from lare_rl.errors import LareError
 
-MAX_CALL_ROWS = 8192
-"""Rows that are processed in one call."""
+MAX_CALL_STEPS = 8192
+"""The most steps of one call; in a batch of episodes, of all agents together. An episode that is longer is one call."""
 
 init_decoder = jax.jit(decoder_state.init, static_argnames="spec")
 observe_steps = jax.jit(decoder_state.observe_steps)
@@ -52,15 +54,29 @@ def fit_by_gradient(
 def training_rewards(
     leaves: list[Array], steps: StepBatch, structure: Any, spec: CreditSpec
 ) -> Float[Array, "rows agents"]:
-    """Return the rewards of steps by a flat `DecoderState`: its leaves and structure, from `jax.tree.flatten`."""
+    """Return the rewards of steps by a `DecoderState`, which is given as its leaves and structure, from `jax.tree.flatten`."""
     return rewards.training_rewards(jax.tree.unflatten(structure, leaves), steps, spec)
 
 
-def call_chunks(n_rows: int) -> Iterator[slice]:
-    """Yield the rows of each call, at most `MAX_CALL_ROWS`."""
-    return (slice(start, start + MAX_CALL_ROWS) for start in range(0, n_rows, MAX_CALL_ROWS))
+def call_chunks(n_steps: int) -> Iterator[slice]:
+    """Yield the steps of each call, at most `MAX_CALL_STEPS`."""
+    return (slice(start, start + MAX_CALL_STEPS) for start in range(0, n_steps, MAX_CALL_STEPS))
 
 
 def on_cpu() -> AbstractContextManager:
-    """Compute on the CPU: decoders of steps are small, and another library may use the accelerator."""
+    """Compute on the CPU: decoders are small, and another library may use the accelerator.
+
+    Raises `LareError` if JAX has no CPU.
+    """
+    _check_cpu()
     return jax.default_device("cpu")
+
+
+@cache
+def _check_cpu() -> None:
+    try:
+        get_backend("cpu")
+    except (RuntimeError, AssertionError) as error:  # the latter if JAX has no device at all
+        raise LareError(
+            "a CreditAssigner computes on the CPU, which the environment variable JAX_PLATFORMS leaves out: add ,cpu to it"
+        ) from error

@@ -20,7 +20,7 @@ from jaxtyping import Int
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.batches import sample_batch, whole_episodes
-from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, call_chunks, on_cpu
+from lare_rl.assigner.compiled_functions import MAX_CALL_STEPS, call_chunks, on_cpu
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit import closed_form, learning, prequential
 from lare_rl.credit.decoder_state import DecoderState
@@ -71,8 +71,9 @@ class DecoderLearner:
     @property
     def is_fitted(self) -> bool:
         if not self._is_fitted and self.config.method.fit is not None:  # cached, because reading the flag waits for JAX
-            uses_gradient = self.config.method.uses_gradient
-            self._is_fitted = self.n_updates > 0 if uses_gradient else bool(learning.is_fitted(self.decoder))
+            with on_cpu():
+                uses_gradient = self.config.method.uses_gradient
+                self._is_fitted = self.n_updates > 0 if uses_gradient else bool(learning.is_fitted(self.decoder))
         return self._is_fitted
 
     def add_steps(
@@ -104,7 +105,7 @@ class DecoderLearner:
         """Process the queues that have become long."""
         if self.n_pending_steps >= MAX_PENDING_STEPS:
             self.flush_inputs()
-        if sum(len(episode.step_ids) for episode in chain.from_iterable(self._pending_episodes)) >= MAX_CALL_ROWS:
+        if sum(len(episode.step_ids) for episode in chain.from_iterable(self._pending_episodes)) >= MAX_CALL_STEPS:
             self.learn_returns()
 
     def flush_inputs(self) -> None:

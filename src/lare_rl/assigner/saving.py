@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from lare_rl.assigner.assigner_config import AssignerConfig
+from lare_rl.assigner.compiled_functions import on_cpu
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.assigner.group_names import GroupName
 from lare_rl.assigner.store import Store, StoredEpisode
@@ -72,7 +73,8 @@ def restore(learner: DecoderLearner, state: AssignerState) -> None:
     if sample := _phi_sample(arrays):
         learner.phi_sample.append(sample)
     learned = {name.removeprefix(LEARNED): array for name, array in arrays.items()}
-    (learner.decoder,) = fill_template((learner.decoder,), learned)
+    with on_cpu():
+        (learner.decoder,) = fill_template((learner.decoder,), learned)
     store = learner.store
     store.n_ended, store.n_ended_steps, store.dropped = map(int, arrays["counts"])
     if "n_added" in arrays:

@@ -12,10 +12,13 @@ from tyro.conf import Positional
 
 from lare_rl.cli.terminal import RunDirectories, print_line, print_progress, print_table
 from lare_rl.errors import LareError
+from lare_rl.runs.metric_names import RETURN
+from lare_rl.sweep.resources import Resources
 
 _BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
 """A directory of the checkout. It does not exist if LaRe was installed from a package index."""
 
+_ONE_RUN = Resources()
 _RAY_HELP = "the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray])."
 Ray = Annotated[str | None, tyro.conf.arg(metavar="ADDRESS", help=_RAY_HELP)]
 
@@ -23,14 +26,15 @@ Ray = Annotated[str | None, tyro.conf.arg(metavar="ADDRESS", help=_RAY_HELP)]
 def sweep(
     file: Annotated[Positional[Path], tyro.conf.arg(metavar="FILE")], ray: Ray = None, check: bool = False
 ) -> None:
-    """Train the runs of a TOML file that are not finished yet. All metrics go to results.csv and results.parquet.
+    """Train the runs of a TOML file that are not finished yet. All metrics go to results.csv beside the runs, and with the
+    extra lare-rl[parquet] to results.parquet.
 
     Args:
         file: lists tasks, methods, algorithms, draws and settings, and how many processes run at a time, on how many cores and
             accelerators each (docs/how-to/sweeps.md).
         check: only check the file, list its runs and how far they are, and train nothing.
     """
-    from lare_rl.cli.sweep_progress import show_progress
+    from lare_rl.cli.sweep_progress import current_step, show_progress
     from lare_rl.compare.metric_tables import read_metric_rows, write_table
     from lare_rl.config.effective import warmup_warning
     from lare_rl.sweep.resources import assign_slots
@@ -47,7 +51,7 @@ def sweep(
             except LareError as error:  # the sweep may be meant for another machine
                 print_progress(f"{error}: the sweep would not begin on this machine")
         for job in jobs:
-            print_line(f"{job.name}: {'done' if job.done else f'step {job.step():,} of {job.resolved.steps:,}'}")
+            print_line(f"{job.name}: {'done' if job.done else f'step {current_step(job):,} of {job.resolved.steps:,}'}")
         return
 
     def write_tables() -> None:
@@ -69,7 +73,7 @@ def sweep(
 
 def compare(
     runs: RunDirectories,
-    metric: Annotated[str, tyro.conf.arg(metavar="KEY")] = "evaluation/return",
+    metric: Annotated[str, tyro.conf.arg(metavar="KEY")] = RETURN,
     at: Annotated[int | None, tyro.conf.arg(metavar="STEP")] = None,
     late: bool = False,
     out: Path = Path("compare.html"),
@@ -93,15 +97,15 @@ def compare(
     results, findings = collect_results(runs, metric)
     for finding in findings:
         print_progress(render(finding, MESSAGES))
-    comparisons = page.write_comparisons(results, out, ScoreChoice(metric, at, late), findings)
+    comparisons, overall = page.write_comparisons(results, out, ScoreChoice(metric, at, late), findings)
     for comparison in comparisons:
         if len(comparisons) > 1:
             print_line(f"\n{comparison.tasks[0]}")
         print_table(*page.comparison_table(comparison))
         print_line(page.describe(comparison))
-    if rows := page.overall_table(comparisons):
+    if overall:
         print_line(f"\n{MESSAGES['over_tasks']}")
-        print_table(page.OVERALL_HEADER, rows)
+        print_table(page.OVERALL_HEADER, overall)
     elif len(comparisons) > 1:
         print_line(f"\n{MESSAGES['no_overall_table']}")
     print_line(MESSAGES["columns"])
@@ -113,9 +117,7 @@ def reproduce(
     budget: Literal["smoke", "laptop", "paper"] = "laptop",
     runs: Path = Path("runs/reproduce"),
     out: Path = Path("results"),
-    processes: int = 1,
-    cores: int = 1,
-    accelerators: float | None = None,
+    resources: Annotated[Resources, tyro.conf.arg(name="")] = _ONE_RUN,
     ray: Ray = None,
 ) -> None:
     """Reproduce a figure or table of the LaRe paper: train its runs, and write a page that compares the results. Needs a checkout.
@@ -123,24 +125,20 @@ def reproduce(
     `real` is not in the paper: five tasks of real simulators, a package of its own (benchmarks/real). `real-wheat` is one of them.
 
     Args:
-        exhibit: the name of a figure or a table, or all (without real); without it, the names are listed.
+        exhibit: the name of an exhibit, or all for every exhibit of the paper; without it, the names are listed.
         budget: smoke only tests that it runs; laptop has 3 seeds, a twentieth of a single agent's steps, and some of the tasks;
             paper has everything.
         runs: the directory of the runs; finished ones are not trained again.
         out: the directory of the pages: OUT/BUDGET/NAME.md, with its pictures and all metrics.
-        processes: number of runs at a time.
-        cores: number of cores for each run.
-        accelerators: number of accelerators for each run; less than 1 if runs share one. By default, an equal share.
+        resources: what the runs use.
     """
     from lare_rl.cli.sweep_progress import show_progress
-    from lare_rl.sweep.resources import Resources
     from lare_rl.training.train import RunInterruptedError
 
     paper = _import_from_checkout("reproduce")
     if exhibit is None:
         print_table(("exhibit", "of the paper", "what it shows"), paper.listed())
         return
-    resources = Resources(processes=processes, cores=cores, accelerators=accelerators)
 
     def write_page(name: str) -> None:
         print_line(f"wrote {paper.reproduce(name, budget, resources, runs, out, ray, show_progress)}")

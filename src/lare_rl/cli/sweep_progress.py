@@ -13,7 +13,7 @@ from lare_rl.errors import LareError
 from lare_rl.sweep.jobs import Job
 from lare_rl.util.sanitize import sanitize
 
-__all__ = ["show_progress", "update_bars"]
+__all__ = ["current_step", "show_progress", "update_bars"]
 
 
 @contextlib.contextmanager
@@ -45,7 +45,7 @@ def update_bars(jobs: Sequence[Job], bars: Progress, ended: threading.Event, ref
     all_runs_id = bars.add_task("all runs", total=sum(job.resolved.steps for job in jobs))
     bar_ids: dict[str, TaskID] = {}
     while not ended.is_set():
-        steps = {job.name: _current_step(job) for job in jobs}
+        steps = {job.name: current_step(job) for job in jobs}
         bars.update(all_runs_id, completed=sum(steps.values()))
         for job in jobs:
             step, total = steps[job.name], job.resolved.steps
@@ -56,8 +56,8 @@ def update_bars(jobs: Sequence[Job], bars: Progress, ended: threading.Event, ref
         ended.wait(refresh_s)
 
 
-def _current_step(job: Job) -> int:
-    """Return the step of a run. A damaged run counts as 0, and the process that trains it reports the damage."""
+def current_step(job: Job) -> int:
+    """Return the step of a run. A damaged run has step 0: the process that trains it reports the damage."""
     try:
         return job.step() if job.started else 0
     except LareError:

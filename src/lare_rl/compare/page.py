@@ -16,7 +16,7 @@ from lare_rl.runs.metric_names import RETURN
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import format_plus_minus
 
-__all__ = ["OVERALL_HEADER", "comparison_table", "describe", "overall_table", "write_comparisons"]
+__all__ = ["OVERALL_HEADER", "comparison_table", "describe", "write_comparisons"]
 
 HEADER = ("method", "seeds", "IQM [95%]", "mean ± sd", "minus baseline [95%]", "above baseline [95%]", "p")
 DRAWS_HEADER = ("draws", "mean [95%], draws")
@@ -28,19 +28,27 @@ def write_comparisons(
     out: Path,
     choice: ScoreChoice = LAST_RETURN,
     findings: Iterable[Finding] = (),
-) -> list[Comparison]:
+) -> tuple[list[Comparison], list[tuple[str, ...]]]:
     """Compare results (`compare_tasks`), and write the page, with the findings about the results at its end.
+
+    Returns:
+        The comparisons, and the rows of the table over all tasks, under `OVERALL_HEADER`. It is empty if there is nothing to compare.
 
     Raises `LareError` if the results cannot be compared, or the file cannot be written.
     """
     comparisons = compare_tasks(results, choice)
+    overall = [
+        (*_first_cells(row, number), *map(_format_cell, (row.improvement, row.p_value)))
+        for number, row in enumerate(compare_over_tasks(comparisons))
+    ]
     tasks = ", ".join(task for comparison in comparisons for task in comparison.tasks)
     title = f"{tasks}: {len({result.label for result in results})} methods"
     notes = [f"Note: {render(finding, MESSAGES)}" for finding in findings]
     if origin := _find_origin(results):
         notes.append(render(origin, MESSAGES))
-    write_page(out, title, "\n".join([f"<h1>{escape(title)}</h1>", *_body(comparisons), *map(render_note, notes)]))
-    return comparisons
+    body = [f"<h1>{escape(title)}</h1>", *_body(comparisons, overall), *map(render_note, notes)]
+    write_page(out, title, "\n".join(body))
+    return comparisons, overall
 
 
 def describe(comparison: Comparison) -> str:
@@ -64,14 +72,6 @@ def comparison_table(comparison: Comparison) -> tuple[tuple[str, ...], list[tupl
     return (*HEADER, *DRAWS_HEADER) if several_draws else HEADER, rows
 
 
-def overall_table(comparisons: Sequence[Comparison]) -> list[tuple[str, ...]]:
-    """Return the rows of the table over all tasks, under `OVERALL_HEADER`. There are none if there is nothing to compare."""
-    return [
-        (*_first_cells(row, number), *map(_format_cell, (row.improvement, row.p_value)))
-        for number, row in enumerate(compare_over_tasks(comparisons))
-    ]
-
-
 def _first_cells(row: OverallRow, number: int) -> tuple[str, str]:
     """Return the method, with a remark in the first row, and the number of its seeds."""
     return row.label if number else f"{row.label} (baseline)", str(row.n_seeds)
@@ -92,7 +92,7 @@ def _find_origin(results: Sequence[LearningCurve]) -> Finding | None:
     return Finding("origin", {"facts": facts}) if facts else None
 
 
-def _body(comparisons: Sequence[Comparison]) -> Iterator[str]:
+def _body(comparisons: Sequence[Comparison], overall: Sequence[tuple[str, ...]]) -> Iterator[str]:
     level = 2 if len(comparisons) == 1 else 3
     for comparison in comparisons:
         if len(comparisons) > 1:
@@ -107,7 +107,9 @@ def _body(comparisons: Sequence[Comparison]) -> Iterator[str]:
         yield render_note(MESSAGES["curves"])
         yield f"<h{level}>Performance profiles</h{level}>"
         yield figures.draw_bands(comparison.profiles, f"x ({score})", "share of runs that score more")
-    if rows := overall_table(comparisons):
+    if overall:
         yield "<h2>All tasks</h2>"
-        yield render_table(OVERALL_HEADER, rows, range(1, len(OVERALL_HEADER)))
+        yield render_table(OVERALL_HEADER, overall, range(1, len(OVERALL_HEADER)))
+    elif len(comparisons) > 1:
+        yield render_note(MESSAGES["no_overall_table"])
     yield render_note(to_text([Finding("columns"), Finding("intervals", {"repetitions": REPETITIONS})]))

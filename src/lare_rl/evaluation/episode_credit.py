@@ -12,13 +12,14 @@ from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.closed_form import ClosedForm, reward_std
 from lare_rl.credit.decoder_settings import RECENT_STEPS
 from lare_rl.credit.decoder_state import DecoderState, score_type_index
-from lare_rl.credit.methods import Fit
+from lare_rl.credit.methods import METHODS, Fit
 from lare_rl.data import replay
-from lare_rl.data.replay import Index, StoredSteps
+from lare_rl.data.replay import Index, Replay, StoredSteps
+from lare_rl.data.sampling import get_episodes
 from lare_rl.runs.directory import Run
 from lare_rl.training.decoder_inputs import decoder_inputs
 from lare_rl.training.learner import Learner
-from lare_rl.training.rewards import rewards
+from lare_rl.training.rewards import has_step_rewards, rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.util.float64 import float64
@@ -33,15 +34,16 @@ class EpisodeCredit:
 
     reward: Float[np.ndarray, "steps agents"]
     """True rewards."""
-    training_reward: Float[np.ndarray, "steps agents"]
-    """By the decoders of the last checkpoint."""
+    proxy_reward: Float[np.ndarray, "steps agents"]
+    """By the decoders of the last checkpoint, in the unit of the return; corrected if `exact`."""
     uncertainty: Float[np.ndarray, " steps"] | None
     """Two posterior standard deviations of the proxy reward. None for many agents, and without a posterior."""
     factors: Float[np.ndarray, "steps rows factors"]
     has_step_rewards: bool
-    """Whether the true rewards of single steps are known: they are not if only the last step has a reward."""
+    """Whether the true rewards of single steps are known: they are not if all rewards of the newest steps are payments."""
     correlations: Float[np.ndarray, " factors"]
-    """Pearson's correlation of each factor with the true reward, over the newest steps of all seeds. NaN if one never varies."""
+    """Pearson's correlation of each factor with the true reward, over the newest steps of all seeds, about `RECENT_STEPS` of each.
+    NaN if one never varies, or step rewards are not known. Empty for many agents, and without phi."""
 
 
 class FactorLabel(NamedTuple):
@@ -59,16 +61,18 @@ def label_factors(run: Run, team_index: int = 0) -> list[FactorLabel]:
         return []
     function = run.functions[team_index]
     names = function.factor_columns(run.scored_observation)
-    n_observations = len(names) // function.size
+    n_observations = len(names) // function.size  # 2 if phi scores the observations before and after a step
     return list(map(FactorLabel, names, function.meanings * n_observations, function.reads * n_observations))
 
 
 def load_episode_credit(run: Run) -> EpisodeCredit | None:
     """Return the credit of a run. None for a method without proxy rewards, and while the first environment has finished no episode."""
+    if not METHODS.find(run.config.settings.method).has_proxy_rewards:  # before a large checkpoint is read
+        return None
     state = load_learner(run)
     config, learner = state.config, select_seed(state.learner)
-    index = _find_newest_episode(learner)
-    if not config.method.has_proxy_rewards or index is None:
+    index = _find_newest_episode(learner.replay)
+    if index is None:
         return None
 
     @jax.jit
@@ -76,20 +80,22 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
         steps = replay.read(learner.replay, index)
         return steps, rewards(steps, learner.decoders, replace(config, scale_rewards=False))
 
-    steps, training_reward = read_rewards(learner, index)
+    steps, proxy_reward = read_rewards(learner, index)
     reward = np.asarray(steps.columns["reward"])
+    newest = _read_newest(state.learner, config)
+    is_known = has_step_rewards(newest.columns["reward"], newest.last[..., None], True)
     return EpisodeCredit(
         reward=reward,
-        training_reward=np.asarray(training_reward),
+        proxy_reward=np.asarray(proxy_reward),
         uncertainty=_uncertainty(steps, learner.decoders[0], config),
         factors=np.asarray(steps.columns.get("factors", np.zeros((len(reward), 1, 0)))),
-        has_step_rewards=bool(reward[~np.asarray(steps.last)].any()),
-        correlations=_factor_correlations(state.learner, config),
+        has_step_rewards=bool(is_known),
+        correlations=_factor_correlations(newest, config, bool(is_known)),
     )
 
 
 def _uncertainty(steps: StoredSteps, decoder: DecoderState, config: TrainConfig) -> Float[np.ndarray, " steps"] | None:
-    if decoder.closed_decoder is None or config.method.fit is Fit.SIGNS or config.n_proxy_rewards > 1:
+    if decoder.closed_decoder is None or config.method.fit is Fit.SIGNS or config.env.n_agents > 1:
         return None
     score_types = config.credit_specs[0].score_types
 
@@ -102,30 +108,27 @@ def _uncertainty(steps: StoredSteps, decoder: DecoderState, config: TrainConfig)
     return 2 * std / np.where(decoder.is_average, steps.length, 1)
 
 
-def _find_newest_episode(learner: Learner) -> Index | None:
+def _find_newest_episode(buffer: Replay) -> Index | None:
     """Return the steps of the last finished episode of a seed's first environment. None if none has finished."""
-    buffer = learner.replay
-    if not int(replay.n_stored_episodes(buffer)[0]):
+    n_episodes = int(replay.n_stored_episodes(buffer)[0])
+    if not n_episodes:
         return None
-    env_index, episode = np.int32(0), np.asarray(buffer.current_episode)[0] - 1
-    start = int(np.asarray(buffer.first)[0, episode % buffer.first.shape[-1]])
-    number = jnp.arange(start, int(jax.jit(replay.end_of_episode)(buffer, env_index, episode)))
-    return Index(jnp.zeros(len(number), int), number)
+    newest = get_episodes(buffer, Index(jnp.int32(0), jnp.int32(n_episodes - 1)))
+    return newest.steps(jnp.arange(int(newest.length)))
 
 
-def _factor_correlations(learners: Learner, config: TrainConfig) -> Float[np.ndarray, " factors"]:
-    """Compute the correlations of a single agent's factors with its true reward, over the newest steps of all seeds.
-
-    They are NaN if only returns are known. The array is empty for many agents, and for a method without phi.
-    """
-    if not config.method.needs_phi or config.n_proxy_rewards > 1 or config.env.n_agents > 1:
-        return np.zeros(0)
+def _read_newest(learners: Learner, config: TrainConfig) -> StoredSteps:
+    """Return about `RECENT_STEPS` newest steps of each seed, of all its environments."""
     buffers = learners.replay
     n_stored = int(np.min(jax.jit(jax.vmap(replay.n_stored_transitions))(buffers)))
-    n_steps = min(RECENT_STEPS, n_stored)
-    steps = jax.jit(jax.vmap(lambda buffer: replay.read(buffer, replay.newest_steps(buffer, n_steps))))(buffers)
-    reward, last = np.asarray(steps.columns["reward"]).ravel(), np.asarray(steps.last).ravel()
+    n_steps = min(max(1, RECENT_STEPS // config.n_envs), n_stored)
+    return jax.jit(jax.vmap(lambda buffer: replay.read(buffer, replay.newest_steps(buffer, n_steps))))(buffers)
+
+
+def _factor_correlations(steps: StoredSteps, config: TrainConfig, is_known: bool) -> Float[np.ndarray, " factors"]:
+    """Compute the correlations of a single agent's factors with its true reward."""
+    if not config.method.needs_phi or config.env.n_agents > 1:
+        return np.zeros(0)
+    reward = np.asarray(steps.columns["reward"]).ravel()
     factors = np.asarray(steps.columns["factors"]).reshape(len(reward), -1)
-    if not reward[~last].any():
-        return np.full(factors.shape[1], np.nan)
-    return column_correlations(factors, reward)
+    return column_correlations(factors, reward) if is_known else np.full(factors.shape[1], np.nan)

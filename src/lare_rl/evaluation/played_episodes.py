@@ -33,7 +33,7 @@ __all__ = [
     "N_SAMPLE_EPISODES",
     "PlayedEpisodes",
     "TeamSample",
-    "compute_training_rewards",
+    "compute_proxy_rewards",
     "play_run",
     "sample_steps",
     "unroll_policy",
@@ -52,8 +52,8 @@ class PlayedEpisodes:
     mask: Bool[np.ndarray, "time episodes"]
     """Whether the episode had not ended before the step."""
     factors: Float[np.ndarray, "time episodes rows factors"]
-    training_reward: Float[np.ndarray, "time episodes agents"] | None
-    """By the decoders of the last checkpoint. None for a method without proxy rewards."""
+    proxy_reward: Float[np.ndarray, "time episodes agents"] | None
+    """By the decoders of the last checkpoint, in the unit of the return. None for a method without proxy rewards."""
     state: Any
     """The states after each step, if the environment is in JAX."""
 
@@ -64,8 +64,8 @@ class PlayedEpisodes:
 
     @property
     def credit(self) -> Float[np.ndarray, "time episodes agents"]:
-        """The training rewards or, for a method without any, the true rewards."""
-        return self.reward if self.training_reward is None else self.training_reward
+        """The proxy rewards or, for a method without any, the true rewards."""
+        return self.reward if self.proxy_reward is None else self.proxy_reward
 
     def select_episode(self, values: Any, episode: int = 0) -> Any:
         """Return the values of an episode until its end, [time ...], from arrays [time episodes ...]."""
@@ -89,15 +89,15 @@ def play_run(run: Run, n_episodes: int = 1, *, actor: Any = None, key: int = 0) 
         batch = unroll_policy(make_jax_env(run.config.task), config, actor, n_episodes, key)
     else:
         batch = _unroll_on_host(run, config, actor, n_episodes)
-    factors, training_reward = compute_host_factors(run, config, batch.steps), None
+    factors, proxy_reward = compute_host_factors(run, config, batch.steps), None
     if config.method.has_proxy_rewards:
-        training_reward = compute_training_rewards(select_seed(learner), batch.steps, factors, config)
+        proxy_reward = compute_proxy_rewards(select_seed(learner), batch.steps, factors, config)
     return PlayedEpisodes(
         config=config,
         steps=batch.steps,
         mask=batch.mask,
         factors=factors,
-        training_reward=training_reward,
+        proxy_reward=proxy_reward,
         state=batch.state,
     )
 
@@ -133,10 +133,10 @@ def _drop_seed_axis(batch: EpisodeBatch) -> EpisodeBatch:
     return jax.tree.map(lambda leaf: leaf[:, 0], jax.device_get(batch))
 
 
-def compute_training_rewards(
+def compute_proxy_rewards(
     learner: Learner, steps: Trajectory, factors: Float[np.ndarray, "time episodes rows factors"], config: TrainConfig
 ) -> Float[np.ndarray, "time episodes agents"]:
-    """Compute the training rewards of whole episodes by the decoders of a single seed."""
+    """Compute the proxy rewards of whole episodes by the decoders of a single seed, in the unit of the return."""
     n_steps, n_episodes = np.shape(steps.next_timestep.terminated)
     # Rewards are computed from stored steps, so a new replay stores these episodes alone.
     buffer = empty_replay(config, n_episodes, 2 * n_steps + 2)  # a repeated last step is an episode of two rows
@@ -148,7 +148,7 @@ def compute_training_rewards(
             since = replay.segments_as_episodes(filled.replay).oldest
             filled = predict_returns(filled._replace(decoders=learner.decoders), since, config)
         stored = replay.read(filled.replay, replay.newest_steps(filled.replay, n_steps))
-        return jnp.swapaxes(rewards(stored, learner.decoders, config), 0, 1)
+        return jnp.swapaxes(rewards(stored, learner.decoders, replace(config, scale_rewards=False)), 0, 1)
 
     return np.asarray(compute(jax.tree.map(jnp.asarray, steps), jnp.asarray(factors)))
 
@@ -162,10 +162,14 @@ class TeamSample:
     factors: Float[np.ndarray, "rows factors"]
     reward: Float[np.ndarray, " rows"]
     """The true reward."""
+    has_step_rewards: bool = True
+    """Whether the true rewards of single steps are known: they are not if only the last steps of episodes have one."""
 
     @property
     def correlations(self) -> Float[np.ndarray, " factors"]:
-        """Pearson's correlation of each factor with the true reward. NaN if one of the two never varies."""
+        """Pearson's correlation of each factor with the true reward. NaN if one of the two never varies, or step rewards are unknown."""
+        if not self.has_step_rewards:
+            return np.full(self.factors.shape[-1], np.nan)
         return column_correlations(self.factors, self.reward)
 
 
@@ -173,11 +177,14 @@ def sample_steps(run: Run, actor: Any = None) -> list[TeamSample]:
     """Return steps of each team, from `N_SAMPLE_EPISODES` episodes of `play_run`."""
     played = play_run(run, N_SAMPLE_EPISODES, actor=actor, key=1)
     config, samples = played.config, []
+    is_known = bool(played.reward[:-1][played.mask[1:]].any())
     steps = jax.tree.map(lambda leaf: np.asarray(leaf)[played.mask], played.steps)  # [steps ...]
     for team_index, role in enumerate(run.config.task.roles):  # its rows of all episodes, as if they were one
         rows = make_episode(role, config.env, steps.timestep, steps.env_action, steps.next_timestep)
         n_factors = config.n_factors[team_index] if config.n_factors else 0
         factors = played.factors[played.mask][:, config.team_slice(team_index), :n_factors]
         next_observation, factors, reward = (x[rows.alive] for x in (rows.next_observation, factors, rows.reward))
-        samples.append(TeamSample(next_observation=next_observation, factors=factors, reward=reward))
+        samples.append(
+            TeamSample(next_observation=next_observation, factors=factors, reward=reward, has_step_rewards=is_known)
+        )
     return samples

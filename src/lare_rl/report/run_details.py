@@ -90,7 +90,7 @@ def _render_single_agent(run: Run, trust: Sequence[str]) -> Iterable[str]:
 
 def _render_credit(credit: EpisodeCredit, labels: Sequence[FactorLabel], trust: Sequence[str]) -> Iterable[str]:
     """Yield the credit of each step of a single agent's episode, and the factors of the steps."""
-    reward, proxy = credit.reward[:, 0], credit.training_reward[:, 0]
+    reward, proxy = credit.reward[:, 0], credit.proxy_reward[:, 0]
     rows = {"True reward": reward[:, None]} if credit.has_step_rewards else {}
     yield _render_heading("Credit over one episode", "proxy")
     yield from trust
@@ -238,7 +238,7 @@ def _render_agents(run: Run, played: PlayedEpisodes, trust: Sequence[str]) -> It
     """Yield what earned the score of each team, the credit of each agent and step, and the factors."""
     roles, samples = run.config.task.roles, sample_steps(run) if run.functions else []
     yield from _render_earnings(run, [sample.correlations for sample in samples] or [np.zeros(0)] * len(roles))
-    reward, proxy = played.select_episode((played.reward, played.training_reward))
+    reward, proxy = played.select_episode((played.reward, played.proxy_reward))
     sums = f"Sum of the true rewards {format_number(reward.sum())}"
     if proxy is not None:
         sums += f", of the proxy rewards {format_number(proxy.sum())}"
@@ -250,7 +250,8 @@ def _render_agents(run: Run, played: PlayedEpisodes, trust: Sequence[str]) -> It
         "each picture has its own scale."
     )
     for role, sample, function in zip(roles, samples, run.functions, strict=False):
-        sections = [_render_correlations(sample), *_render_tsne(sample), render_function(function)]
+        pictures = [_render_correlations(sample), *_render_tsne(sample)] if sample.has_step_rewards else []
+        sections = [*pictures, render_function(function)]
         yield render_fold(f"The latent function of {role.name}", sections)
 
 

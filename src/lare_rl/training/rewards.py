@@ -85,11 +85,18 @@ def accuracy_metrics(
     All values are NaN if only the last steps of episodes (`last`) have a reward, because the true rewards of single steps are then
     unknown. The error is left out unless proxy rewards are in the unit of the true rewards (`calibrated`).
     """
-    has_step_rewards = jnp.any((reward != 0) & mask & ~last)
+    is_known = has_step_rewards(reward, last, mask)
     values = {"credit/correlation": masked_correlation(r_hat, reward, mask)}
     if calibrated:
         values["credit/error"] = mean_absolute_error(r_hat, reward, mask)
-    return {name: jnp.where(has_step_rewards, value, jnp.nan) for name, value in values.items()}
+    return {name: jnp.where(is_known, value, jnp.nan) for name, value in values.items()}
+
+
+def has_step_rewards(
+    reward: Float[Array, "*steps"], last: Bool[Array, "*steps"], mask: Bool[Array, "*steps"] | bool
+) -> Bool[Array, ""]:
+    """Return whether the true rewards of single steps are known: a step that is not the last of an episode or a segment has one."""
+    return jnp.any((reward != 0) & mask & ~last)
 
 
 def mean_absolute_error(
