@@ -232,6 +232,15 @@ def test_refused_options_of_a_response(serve):
     assert limits == [REPLY_TOKENS, REPLY_TOKENS, REPLY_TOKENS // 2]
 
 
+def test_refusal_of_a_text_does_not_change_a_known_form(serve):
+    server, model, _ = serve(reply_with("hello"), refuse(400, "against the rules"), reply_with("again"))
+    assert model.reply(REQUEST, 0) == "hello"
+    with pytest.raises(ModelError, match="against the rules"):
+        model.reply(REQUEST, 1)
+    assert model.reply(REQUEST, 2) == "again"
+    assert server.apis == ["responses"] * 3
+
+
 def test_error_of_a_known_responses_api_is_retried(serve):
     server, model, pauses = serve(reply_with("hello"), refuse(500), raw_answer(b"{}"), reply_with("again"))
     assert [model.reply(REQUEST, number) for number in range(2)] == ["hello", "again"]

@@ -52,6 +52,7 @@ def test_malformed_reply(text, words):
         (f"<think>As {json.dumps(GOOD)}?</think>\n{json.dumps(WITH_CODE)}", "u"),
         (f"```\n{GOOD['Functions']}\n```\nNo.</thinking>\n```\n{CODE}\n```", "\n"),
         (json.dumps(WITH_CODE | {"Understand": "</think>"}), "</think>"),
+        (f"Here it is: {json.dumps(WITH_CODE | {'Understand': '</think>'})}", "</think>"),
         (f"A draft: {json.dumps(GOOD)}, or better: {json.dumps(WITH_CODE)}", "u"),
         (f'First {{"Functions": "draft"}}, then {json.dumps(WITH_CODE)}, {{"Functions": "x"}}', "u"),
         ("{}" * 150 + json.dumps(WITH_CODE), "u"),

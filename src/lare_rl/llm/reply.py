@@ -83,15 +83,18 @@ def _check_characters(text: str) -> None:
 
 
 def _find_object(text: str) -> dict[str, Any] | None:
-    """Return the last complete object within a text, or else the function in a fenced block."""
+    """Return the last complete object that ends after the reasoning, or else the function in such a fenced block."""
     decoder = json.JSONDecoder(strict=False, parse_int=parse_integer)
     incomplete = None
-    text = _REASONING_END.split(text)[-1]
+    reasoning_end = max((match.end() for match in _REASONING_END.finditer(text)), default=0)
     starts = [match.start() for match in _OBJECT_START.finditer(text)]
     for start in reversed(starts[-_MAX_STARTS:]):
         try:
-            value = check_depth(decoder.raw_decode(text, start)[0])
+            value, end = decoder.raw_decode(text, start)
+            check_depth(value)
         except (ValueError, RecursionError):
+            continue
+        if end <= reasoning_end:
             continue
         if value.keys() >= set(REPLY_KEYS):
             return value
@@ -100,6 +103,6 @@ def _find_object(text: str) -> dict[str, Any] | None:
     if incomplete is not None:
         return incomplete
     for fence in _FENCED_BLOCK.finditer(text):
-        if "def " in fence[2]:
-            return dict(zip(REPLY_KEYS, (text[: fence.start()], "", fence[2]), strict=True))
+        if fence.end() > reasoning_end and "def " in fence[2]:
+            return dict(zip(REPLY_KEYS, (text[reasoning_end : fence.start()], "", fence[2]), strict=True))
     return None

@@ -125,8 +125,10 @@ class RequestForms:
             return older_limit
         if "temperature" in reason and has_temperature and self.has_temperature:
             return replace(self, has_temperature=False)
+        if self.is_verified:  # the server has answered this form before, so it refuses the text
+            return None
         if len(self.forms) > 1:
-            return replace(self, forms=self.forms[1:], is_verified=False)
+            return replace(self, forms=self.forms[1:])
         return older_limit
 
     def read_answer(self, body: bytes) -> Answer:
