@@ -56,9 +56,8 @@ class Comparison:
 
 LEARNING, SWEEP, GPU = "learning", "sweeps/closed-form", "closed-form-gpu"
 LAPTOP, FULL, WHY = "reproduce/laptop", "sweeps/closed-form-full", "why"
-STUDY = frozenset({"episodic", "dense", "rrdu", "lare-rrdu", "lare-bayes", "bayes"})
-"""The methods of `lare-rl reproduce real`. Other runs on its tasks explain results, and are in `why`."""
-WHOLE_EPISODE = "-whole-episode"
+PUBLISHED, WHOLE_EPISODE, OWN_DELAY = "-published", "-whole-episode", "-own-delay"
+"""Endings of runs of `lare-rl reproduce real`: see `benchmarks/real/study.toml`."""
 STYLE: Any = {"font.family": "sans-serif", "font.size": 11, "svg.fonttype": "none", "svg.hashsalt": "lare"}
 """Of pictures."""
 
@@ -86,33 +85,26 @@ def hidden(task: str) -> Comparison:
     )
 
 
-def simulator_runs(task: str, algorithm: str, method: str) -> Directories:
-    """The runs of a method on a simulator: seeds 0 to 4, and 5 to 9. METHOD-whole-episode is PPO with gamma = lambda = 1."""
-    if method not in STUDY:
-        return [f"{WHY}/{task}/{method}/seeds-{first}" for first in (0, 5)]
-    suffix = "-published" if method == "lare-rrdu" else ""
-    environment = f"{task}Proxy" if method == "dense" else task
-    return [f"{LAPTOP}/real/seeds-{first}/{environment}/{method}-{algorithm}{suffix}" for first in (0, 5)]
+def simulator_runs(task: str, algorithm: str, method: str, ending: str = "") -> Directories:
+    """The runs of a method on a simulator: seeds 0 to 4, and 5 to 9."""
+    environment = f"{task}Proxy" if method == "dense" and ending != OWN_DELAY else task
+    return [f"{LAPTOP}/real/seeds-{first}/{environment}/{method}-{algorithm}{ending}" for first in (0, 5)]
 
 
-def simulator(task: str, algorithm: str, steps: int, whole_episodes: Sequence[str] = ()) -> Comparison:
+def simulator(task: str, algorithm: str, steps: int, episodic: str = "", dense: str = "") -> Comparison:
     """A simulator whose score exists only at the end. A dense proxy of the score takes the place of true rewards.
 
     Args:
-        whole_episodes: the references that learn better with gamma = lambda = 1, and have this setting.
+        episodic, dense: the endings of the references: of those that were trained, these score most.
     """
-
-    def runs(method: str) -> Directories:
-        return simulator_runs(task, algorithm, method + WHOLE_EPISODE if method in whole_episodes else method)
-
     return Comparison(
         steps,
-        runs("episodic"),
-        runs("dense"),
-        {"rrdu": runs("rrdu")},
-        runs("lare-rrdu"),
-        runs("lare-bayes"),
-        runs("bayes"),
+        simulator_runs(task, algorithm, "episodic", episodic),
+        simulator_runs(task, algorithm, "dense", dense),
+        {"rrdu": simulator_runs(task, algorithm, "rrdu")},
+        simulator_runs(task, algorithm, "lare-rrdu", PUBLISHED),
+        simulator_runs(task, algorithm, "lare-bayes"),
+        simulator_runs(task, algorithm, "bayes"),
     )
 
 
@@ -121,8 +113,8 @@ TEN_SEEDS = "scores/cheetah/HalfCheetah-v4,paidonce"
 THRESHOLD = "scores/threshold/HalfCheetahThreshold-v4"
 COMPARISONS = {
     "wheat, SAC": simulator("Wheat", "sac", 6_000),
-    "traffic, PPO": simulator("Traffic", "ppo", 36_000, ["episodic"]),
-    "job shop, PPO": simulator("JobShop", "ppo", 100_000, ["episodic", "dense"]),
+    "traffic, PPO": simulator("Traffic", "ppo", 36_000, WHOLE_EPISODE),
+    "job shop, PPO": simulator("JobShop", "ppo", 100_000, WHOLE_EPISODE, WHOLE_EPISODE),
     # LaRe as published and the proxy are not trained yet.
     "power grid, PPO": replace(simulator("Grid", "ppo", 30_720), paper=(), dense=()),
     "trains, IPPO": simulator("Trains", "ippo", 60_000),

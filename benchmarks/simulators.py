@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import wilcoxon
 
-from gap import RESULTS, STYLE, WHOLE_EPISODE, simulator_runs
+from gap import OWN_DELAY, PUBLISHED, RESULTS, STYLE, WHOLE_EPISODE, simulator_runs
 from lare_rl.report.figures import COLOURS, add_white_background, to_svg
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "simulators.svg"
@@ -42,26 +42,38 @@ TASKS = {
     "Trains": Task("trains, IPPO", "ippo", "wait while blocked", -4.30, -35),
 }
 METHODS = {
-    "episodic": "score at the end",
-    "episodic-whole-episode": "score at the end, gamma = lambda = 1",
-    "ircr": "one reward for all steps of an episode, `ircr`",
-    "lare-bayes": "LaRe, closed form, `lare-bayes`",
-    "bayes": "closed form, raw features, `bayes`",
-    "rrdu": "RRD-unbiased, `rrdu`",
-    "lare-rrdu": "LaRe as published, `lare-rrdu`",
-    "dense": "dense proxy",
-    "dense-whole-episode": "dense proxy, gamma = lambda = 1",
+    ("episodic", ""): "score at the end",
+    ("episodic", WHOLE_EPISODE): "score at the end, gamma = lambda = 1",
+    ("dense", OWN_DELAY): "own delay at the end, gamma = lambda = 1",
+    ("ircr", ""): "one reward for all steps of an episode, `ircr`",
+    ("lare-bayes", ""): "LaRe, closed form, `lare-bayes`",
+    ("bayes", ""): "closed form, raw features, `bayes`",
+    ("rrdu", ""): "RRD-unbiased, `rrdu`",
+    ("lare-rrdu", PUBLISHED): "LaRe as published, `lare-rrdu`",
+    ("dense", ""): "dense proxy",
+    ("dense", WHOLE_EPISODE): "dense proxy, gamma = lambda = 1",
 }
-CURVES = {"episodic": "#777777", "lare-bayes": COLOURS[0], "bayes": COLOURS[2], "dense": COLOURS[1]}
+"""Methods, with the ending of their runs."""
+AT_END = [("episodic", ""), ("episodic", WHOLE_EPISODE), ("dense", OWN_DELAY)]
+PROXIES = [("dense", ""), ("dense", WHOLE_EPISODE)]
+CURVES = {
+    "score at the end": (AT_END, "#777777"),
+    "LaRe, closed form": ([("lare-bayes", "")], COLOURS[0]),
+    "closed form, raw features": ([("bayes", "")], COLOURS[2]),
+    "dense proxy": (PROXIES, COLOURS[1]),
+}
+"""Lines of the picture: of several settings, the one that scores most at the end."""
 COLUMNS = "n", "mean of all evaluations", "more", "p", "at the end", "more", "p", "deterministic"
 RETURN, DETERMINISTIC = "evaluation/return", "evaluation/deterministic_return"
 Lines = list[dict[str, Any]]
+Runs = dict[tuple[str, str], list[Lines]]
+"""The evaluations of each seed, by method and ending."""
 
 
-def read_seeds(task: str, method: str) -> list[Lines]:
+def read_seeds(task: str, method: str, ending: str) -> list[Lines]:
     """Return the evaluations of each seed; nothing if the method was not trained on the task."""
     seeds: dict[int, Lines] = {}
-    for directory in simulator_runs(task, TASKS[task].algorithm, method):
+    for directory in simulator_runs(task, TASKS[task].algorithm, method, ending):
         path = RESULTS / directory / "metrics.jsonl"
         for line in map(json.loads, path.read_text().splitlines() if path.exists() else []):
             seeds.setdefault(line["seed"], []).append(line)
@@ -78,12 +90,18 @@ def last(seeds: list[Lines], metric: str) -> list[float]:
     return [lines[-1][metric] for lines in seeds if metric in lines[-1]]
 
 
-def print_table(seeds: dict[str, list[Lines]]) -> None:
+def best(seeds: Runs, settings: list[tuple[str, str]]) -> list[Lines] | None:
+    """Return the runs of the setting that scores most at the end; None if none was trained."""
+    trained = [seeds[setting] for setting in settings if setting in seeds]
+    return max(trained, key=lambda runs: np.mean(last(runs, RETURN)), default=None)
+
+
+def print_table(seeds: Runs) -> None:
     """Print a row for each method."""
     print(f"| | {' | '.join(COLUMNS)} |\n{'|---' * (len(COLUMNS) + 1)}|")
-    baseline = "episodic-whole-episode" if "episodic-whole-episode" in seeds else "episodic"
+    reference = best(seeds, AT_END)
+    assert reference is not None
     for method, runs in seeds.items():
-        reference = seeds[baseline]
         deterministic = last(runs, DETERMINISTIC)
         cells = [
             *(METHODS[method], str(len(runs))),
@@ -108,23 +126,20 @@ def format_mean(values: list[float]) -> str:
     return f"{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f}"
 
 
-def draw(tasks: dict[str, dict[str, list[Lines]]]) -> str:
-    """Draw a panel for each task: the mean over seeds, and two standard errors on each side.
-
-    From the score at the end, and from the proxy, PPO is drawn with gamma = lambda = 1 where that was trained.
-    """
+def draw(tasks: dict[str, Runs]) -> str:
+    """Draw a panel for each task: the mean over seeds, and two standard errors on each side."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(15, 3.2), layout="constrained")
         for axes, (name, seeds) in zip(np.ravel(figure.subplots(1, len(tasks))), tasks.items(), strict=True):
             task = TASKS[name]
-            for method, colour in CURVES.items():
-                runs = seeds.get(method + WHOLE_EPISODE, seeds.get(method))
+            for label, (settings, colour) in CURVES.items():
+                runs = best(seeds, settings)
                 if runs is None:
                     continue
                 steps = np.array([line["step"] for line in runs[0]]) / 1000
                 returns = np.array([[line[RETURN] for line in lines] for lines in runs])
                 mean, error = returns.mean(axis=0), returns.std(axis=0, ddof=1) / np.sqrt(len(returns))
-                axes.plot(steps, mean, color=colour, label=METHODS[method].partition(", `")[0])
+                axes.plot(steps, mean, color=colour, label=label)
                 axes.fill_between(steps, mean - 2 * error, mean + 2 * error, color=colour, alpha=0.18, linewidth=0)
             axes.axhline(task.rule_score, color="#000000", linewidth=1, linestyle=":", label="best rule of thumb")
             axes.set(title=task.title, xlabel="thousand steps")
@@ -140,7 +155,7 @@ def main() -> None:
     """Print the tables, and draw the picture."""
     tasks = {}
     for name in TASKS:
-        seeds = {method: read_seeds(name, method) for method in METHODS}
+        seeds = {method: read_seeds(name, *method) for method in METHODS}
         tasks[name] = {method: lines for method, lines in seeds.items() if lines}
         print(f"\n{name}\n")
         print_table(tasks[name])

@@ -54,6 +54,8 @@ class Method(CheckedModel):
     """Whether it trains on the dense proxy of the task."""
     ending: str = ""
     """The ending of its runs' names, if another method differs in settings alone."""
+    tasks: tuple[str, ...] = tuple(SIMULATORS)
+    """The tasks that it is trained on."""
     settings: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -109,7 +111,11 @@ def plan_jobs(budget: str, root: Path, tasks: Sequence[str]) -> Jobs:
             "the tasks are a package of their own: pip install -e 'benchmarks/real[wheat,traffic,jobshop,trains,grid]'"
         )
     return {
-        name: {label: list(_plan_runs(name, method, budget, root)) for label, method in read_study().methods.items()}
+        name: {
+            label: list(_plan_runs(name, method, budget, root))
+            for label, method in read_study().methods.items()
+            if name in method.tasks
+        }
         for name in tasks
     }
 

@@ -104,7 +104,7 @@ def published_methods() -> Iterator[Row]:
     for score in ("door", "sum"):
         yield from corridor(score, one_agent, "rrdu")
     for name in ("CN-6", "PP-6"):
-        for method in ("episodic", "rrdu", "lrr", "tar2", "bayes", "lare-bayes"):
+        for method in ("episodic", "dense", "lare-rd", "rrdu", "lrr", "tar2", "bayes", "lare-bayes"):
             yield particle(name, method, read_task(name), method, method == "rrdu")
 
 
