@@ -4,13 +4,13 @@
 
 It reads `results/`, writes `docs/pictures/gap.svg` and prints the first table of `docs/results/README.md`. The share of a run is
 (return - total at the end) / (true rewards - total at the end), with means over seeds as the two references. A seed that was trained
-several times counts once, with the mean of its runs. Intervals are those of 95% by a bootstrap over seeds, of the references too. A
-task has a share if its gap is larger than two standard errors.
+several times counts once, with the mean of its runs. Intervals are those of 95% by a bootstrap over tasks and over seeds, of the
+references too. A task has a share if its gap is larger than two standard errors.
 """
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -292,11 +292,33 @@ def estimate_share(comparisons: Sequence[Comparison], method: str) -> tuple[floa
     """The interquartile mean of a method's shares, and its interval."""
     random, samples = np.random.default_rng(0), read_samples(comparisons, method)
     repeated = [
-        mean_share([Sample(*(resample(values, random) for values in sample)) for sample in samples])
-        for _ in range(REPETITIONS)
+        mean_share([Sample(*(resample(values, random) for values in samples[task])) for task in tasks])
+        for tasks in resample_tasks(len(samples), random)
     ]
     low, high = np.percentile(repeated, (2.5, 97.5))
     return mean_share(samples), float(low), float(high)
+
+
+def estimate_difference(comparisons: Sequence[Comparison], method: str, other: str) -> tuple[float, float, float]:
+    """How much higher a method's interquartile mean is than that of another, and the interval. Both have the same references."""
+    random = np.random.default_rng(0)
+    pairs = list(zip(read_samples(comparisons, method), read_samples(comparisons, other), strict=True))
+    repeated = []
+    for tasks in resample_tasks(len(pairs), random):
+        samples: tuple[list[Sample], list[Sample]] = [], []
+        for pair in (pairs[task] for task in tasks):
+            episodic, dense = resample(pair[0].episodic, random), resample(pair[0].dense, random)
+            for sample, chosen in zip(pair, samples, strict=True):
+                chosen.append(Sample(resample(sample.method, random), episodic, dense))
+        repeated.append(mean_share(samples[0]) - mean_share(samples[1]))
+    low, high = np.percentile(repeated, (2.5, 97.5))
+    return mean_share([a for a, _ in pairs]) - mean_share([b for _, b in pairs]), float(low), float(high)
+
+
+def resample_tasks(n_tasks: int, random: np.random.Generator) -> Iterator[Sequence[int]]:
+    """Yield the tasks of each repetition."""
+    for _ in range(REPETITIONS):
+        yield [0] if n_tasks == 1 else random.integers(n_tasks, size=n_tasks).tolist()
 
 
 def draw(rows: Mapping[str, Mapping[str, tuple[float, float, float]]]) -> str:
@@ -353,6 +375,9 @@ def main() -> None:
     for name, estimates in rows.items():
         texts = [f"{method} {value:.2f} [{low:.2f}, {high:.2f}]" for method, (value, low, high) in estimates.items()]
         print(name.replace("\n", ", "), "; ".join(texts), sep=": ")
+    for other in (PAPER, RAW):
+        value, low, high = estimate_difference(complete, DEFAULT, other)
+        print(f"{DEFAULT} above {other}: {value:.2f} [{low:.2f}, {high:.2f}]")
     means = [f"{method} {np.mean(seed_shares(read_samples(complete, method))):.2f}" for method in METHODS]
     print(f"mean of these tasks: {'; '.join(means)}")
     PICTURE.write_text(draw(rows) + "\n", encoding="utf-8")
