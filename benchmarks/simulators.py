@@ -2,9 +2,10 @@
 
     PYTHONPATH=benchmarks python benchmarks/simulators.py
 
-For each task and method, a table has the mean of all evaluations, and the score at the end of training, of the sampled and of the
-deterministic policy. *More* is the mean difference to learning from the score at the end alone, in the better of its settings, with
-its standard error; p is that of Wilcoxon's signed-rank test. Seeds are paired: a seed has the same held-out episodes in all methods.
+For each task and method, a table has the mean of all evaluations, and the score at the end of training: mean and interquartile mean of
+the sampled policy, and the mean of the deterministic one. *More* is the mean difference to learning from the score at the end alone, in
+the better of its settings, with its standard error; p is that of Wilcoxon's signed-rank test. Seeds are paired: a seed has the same
+held-out episodes in all methods.
 The curves are in `docs/pictures/simulators.svg`.
 """
 
@@ -18,6 +19,7 @@ from matplotlib.figure import Figure
 from scipy.stats import wilcoxon
 
 from gap import OWN_DELAY, PUBLISHED, RESULTS, STYLE, WHOLE_EPISODE, simulator_runs
+from lare_rl.compare.bootstrap import estimate, interquartile_mean
 from lare_rl.report.figures import COLOURS, add_white_background, to_svg
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "simulators.svg"
@@ -63,7 +65,7 @@ CURVES = {
     "dense proxy": (PROXIES, COLOURS[1]),
 }
 """Lines of the picture: of several settings, the one that scores most at the end."""
-COLUMNS = "n", "mean of all evaluations", "more", "p", "at the end", "more", "p", "deterministic"
+COLUMNS = "n", "mean of all evaluations", "more", "p", "at the end", "IQM [95%]", "more", "p", "deterministic"
 RETURN, DETERMINISTIC = "evaluation/return", "evaluation/deterministic_return"
 Lines = list[dict[str, Any]]
 Runs = dict[tuple[str, str], list[Lines]]
@@ -106,7 +108,9 @@ def print_table(seeds: Runs) -> None:
         cells = [
             *(METHODS[method], str(len(runs))),
             *compare(mean_returns(runs), mean_returns(reference)),
-            *compare(last(runs, RETURN), last(reference, RETURN)),
+            format_mean(last(runs, RETURN)),
+            str(estimate(interquartile_mean, np.array(last(runs, RETURN))[:, None])),
+            *compare(last(runs, RETURN), last(reference, RETURN))[1:],
             format_mean(deterministic) if deterministic else "-",
         ]
         print(f"| {' | '.join(cells)} |")

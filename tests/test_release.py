@@ -45,6 +45,7 @@ def test_wheel_does_the_main_job_without_the_checkout(built, tmp_path):
     assert (done.returncode, done.stdout) == (0, "wrote run/report.html\n"), done.stderr
 
 
+@pytest.mark.long
 def test_released_files(built):
     wheel, sdist = built
     package = f"lare_rl-{lare_rl.__version__}"

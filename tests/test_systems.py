@@ -109,6 +109,7 @@ def task(tmp_path):
     return tmp_path / "study.toml"
 
 
+@pytest.mark.long
 def test_task_and_function(run_elsewhere, task):
     run_elsewhere(LOST)
     run_elsewhere(PROGRAM, "new-task Pendulum-v1 --out new.toml", "verify phi.py --task pendulum.toml --kind reward")

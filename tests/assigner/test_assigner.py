@@ -159,7 +159,8 @@ def test_no_step_is_paid_for_the_start_value_of_a_sum(start_value, phi):
     assert credit.metrics()["credit/return_r2"] > 0.9 or not start_value
 
 
-@pytest.mark.parametrize("groups", [long_case(False), True])
+@pytest.mark.long
+@pytest.mark.parametrize("groups", [False, True])
 def test_gradient_decoders_pay_no_step_for_the_start_value(groups):
     settings = SMALL_CREDIT.model_copy(update={"score": "auto", "learning_rate": 0.01, "steps": 100})
     credit = small_assigner("rd", settings=settings, groups=groups)
@@ -176,6 +177,7 @@ def test_gradient_decoders_pay_no_step_for_the_start_value(groups):
     assert credit.metrics()["credit/return_r2"] > 0.8
 
 
+@pytest.mark.long
 def test_start_value_of_long_episodes():
     credit, random = (
         small_assigner("bayes", settings=SMALL_CREDIT.model_copy(update={"score": "auto"}), capacity=400_000),
@@ -531,7 +533,8 @@ SCORES = {
 """Scores of the observations after the steps of an episode."""
 
 
-@pytest.mark.parametrize("score", ["largest", long_case("smallest"), long_case("sum")])
+@pytest.mark.long
+@pytest.mark.parametrize("score", ["largest", "smallest", "sum"])
 def test_must_learn_scores_that_are_no_sum(score):
     """The history predicts new scores, and is worse than sums nowhere. The steps that make the score get the rewards."""
     sums, history = small_assigner("bayes"), small_assigner("bayes-history")
@@ -577,7 +580,8 @@ def test_must_learn_the_value_of_events_in_order():
     assert abs(other) < 0.05
 
 
-@pytest.mark.parametrize("method", ["bayes", long_case("rd")])
+@pytest.mark.long
+@pytest.mark.parametrize("method", ["bayes", "rd"])
 def test_must_not_credit_steps_for_the_level(method, tmp_path):
     """Easy levels have larger returns and another state. With groups, the state gets no credit."""
     rng, names = np.random.default_rng(0), ("easy", "hard", "night")

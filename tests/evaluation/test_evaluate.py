@@ -154,6 +154,7 @@ def test_number_of_random_episodes(run_steps, longest, n_episodes):
     assert n_random_episodes(run_steps, longest) == n_episodes
 
 
+@pytest.mark.long
 def test_most_likely_actions_beside_sampled_ones(small, tmp_path, command):
     """Of a policy over choices: at the last evaluation, and by `lare-rl evaluate`, with the difference from random actions."""
     settings = small(algorithm="ppo", method="dense", steps=120)
@@ -180,6 +181,7 @@ def test_measures_of_random_play(run, command):
     assert distances.std() > 0
 
 
+@pytest.mark.long
 def test_random_actions_play_the_same_groups(small, tmp_path, command):
     """Otherwise a sentence says so. The mean of the numbers of the groups is not reported."""
     task = levels_spec(payments=2)

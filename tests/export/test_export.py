@@ -262,6 +262,7 @@ def export(export_run):
     return run, exported
 
 
+@pytest.mark.long
 def test_functions_without_lare(export):
     run, exported = export
     directory, rng = Path(exported.__file__).parent, np.random.default_rng(0)

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import lare_rl
+from helpers.long_tests import long_case
 from helpers.toy_envs import toy_spec
 from helpers.toy_logs import PHI, logged_episodes, read_directory
 from lare_rl import LareError
@@ -31,6 +32,7 @@ def codes(result):
     return [finding.code for finding in result.findings]
 
 
+@pytest.mark.long
 def test_linear_score(folder, tmp_path):
     """Nothing is learned from episodes that were cut. They get rewards too."""
     episodes = list(logged_episodes(120))
@@ -70,6 +72,7 @@ def test_groups_share_an_intercept(tmp_path):
     assert abs(means[0] - means[1]) < 1.5  # without groups: about 10
 
 
+@pytest.mark.long
 def test_predicted_returns_have_the_part_that_no_step_is_paid_for(tmp_path):
     episodes = list(logged_episodes(80, max_length=8))
     for episode in episodes:
@@ -100,7 +103,7 @@ def new_rewards(path):
     return [episode["rewards"] for episode in read_directory(path)]
 
 
-@pytest.mark.parametrize(("window", "score", "exact"), [(2, "sum", "last"), (8, "average", "no")])
+@pytest.mark.parametrize(("window", "score", "exact"), [(2, "sum", "last"), long_case(8, "average", "no")])
 def test_payments_for_a_fixed_number_of_steps(window, score, exact, task, tmp_path):
     """Steps are in no payment, or in two. What each payment lacks is 0, so that `exact` changes nothing."""
     episodes, rewards = paid_every_4(list(logged_episodes(80)), window, mean=score == "average")
@@ -115,7 +118,7 @@ def test_payments_for_a_fixed_number_of_steps(window, score, exact, task, tmp_pa
     assert score == "average" or np.abs(unpaid[0]).max() < 0.05
 
 
-@pytest.mark.parametrize(("exact", "window"), [("last", 8), ("spread", None)])
+@pytest.mark.parametrize(("exact", "window"), [long_case("last", 8), ("spread", None)])
 def test_exact_pays_what_each_payment_lacks(exact, window, task, tmp_path):
     """The steps that a payment is for then add up to it, if no other payment is for them."""
     episodes, _ = paid_every_4([e for e in logged_episodes(60, noise=True) if len(e["actions"]) % 4 != 1], window or 4)
@@ -160,6 +163,7 @@ def test_score_of_noise(tmp_path):
     assert codes(result) == ["relabelled", "r2", "worthless"]
 
 
+@pytest.mark.long
 def test_relabel_twice_in_place(folder, tmp_path):
     """The second fit is to the original rewards, so that nothing changes."""
     path = folder(logged_episodes(40))

@@ -78,12 +78,13 @@ def add_all(closed, buffer, config):
     return episodes.fold_episodes(closed, buffer, jnp.zeros_like(buffer.oldest), body, config)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("method", "algorithm", "env", "payments"),
     [
         ("lare-linear", "ippo", ONE_TEAM, PAID_AT_END),
-        long_case("lare-bayes", "td3", ONE_AGENT, PAID_AT_END),
-        long_case("rd-linear", "td3", ONE_AGENT, PaymentRule(period=4)),
+        ("lare-bayes", "td3", ONE_AGENT, PAID_AT_END),
+        ("rd-linear", "td3", ONE_AGENT, PaymentRule(period=4)),
     ],
 )
 def test_learn_returns_keeps_the_statistics_from_scratch(method, algorithm, env, payments, monkeypatch):

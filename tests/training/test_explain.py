@@ -34,10 +34,12 @@ def check_explanation(run, messages):
     assert "<li" in bars
 
 
+@pytest.mark.long
 def test_explain_run(learned_training):
     check_explanation(*learned_training)
 
 
+@pytest.mark.long
 def test_explanation_is_compiled_from_shapes(learned_training):
     """As a thread does while steps are collected. The first explanation then compiles nothing."""
     run, _ = learned_training

@@ -224,6 +224,7 @@ def change_state(run, change):
     np.savez(run.checkpoint / "state.npz", **arrays)
 
 
+@pytest.mark.long
 def test_checkpoint_of_other_environments_is_refused(dense_run, tmp_path):
     run = copy_run(dense_run, tmp_path / "run")
     for changed in (np.zeros(7), np.array("text"), None):

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.long_tests import long_case
 from helpers.small_configs import (
     LENGTHS,
     ONE_AGENT,
@@ -37,14 +36,15 @@ def sums_of_payments(values, last):
     return np.add.reduceat(values[: ends[-1]], np.append(0, ends[:-1]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("method", "algorithm", "env", "exact", "payments"),
     [
-        long_case("rd-linear", "td3", ONE_AGENT, "last", PaymentRule(period=4)),
+        ("rd-linear", "td3", ONE_AGENT, "last", PaymentRule(period=4)),
         ("rd", "ippo", TWO_TEAMS, "spread", PAID_AT_END),
-        long_case("rd-linear", "td3", ONE_AGENT, "spread", PaymentRule(period=4)),
-        long_case("rd-linear", "ippo", TWO_TEAMS, "last", PaymentRule(nonzero=True)),
-        long_case("rd", "ppo", ONE_AGENT, "last", PaymentRule(period=3)),
+        ("rd-linear", "td3", ONE_AGENT, "spread", PaymentRule(period=4)),
+        ("rd-linear", "ippo", TWO_TEAMS, "last", PaymentRule(nonzero=True)),
+        ("rd", "ppo", ONE_AGENT, "last", PaymentRule(period=3)),
     ],
 )
 def test_exact_rewards_add_up_to_payments(method, algorithm, env, exact, payments):

@@ -124,7 +124,8 @@ def train_step(config, learner, steps, train=None):
     return train(add_seed_axis(learner), add_seed_axis(steps), jax.random.key(0)[None], jnp.array(0))
 
 
-@pytest.mark.parametrize("method", [long_case("dense"), long_case("lare-rd"), "lare-rrdu"])
+@pytest.mark.long
+@pytest.mark.parametrize("method", ["dense", "lare-rd", "lare-rrdu"])
 def test_train_step_updates_once_for_enough_episodes(method):
     config, steps = qmix_config(method), random_steps(ONE_TEAM, 2)
     updated, metrics = train_step(config, learner_with_episodes(config), steps)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from helpers.jax_toy_envs import echo_spec
-from helpers.long_tests import long_case
 from helpers.small_configs import ONE_TEAM, random_steps, small_config, untrained_learner
 from helpers.training_runs import ECHO_PHI, QUICK_CREDIT
 from lare_rl.config.resolve import resolve
@@ -88,13 +87,14 @@ def assert_equal_sessions(training, other):
         np.testing.assert_allclose(leaf, other_leaf, rtol=1e-4, atol=1e-5, err_msg=jax.tree_util.keystr(path))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("algorithm", "method"),
     [
         ("ippo", "lare-rd"),
-        long_case("ippo", "lare-bayes"),
-        long_case("qmix", "lare-rd"),
-        long_case("qmix", "lare-bayes"),
+        ("ippo", "lare-bayes"),
+        ("qmix", "lare-rd"),
+        ("qmix", "lare-bayes"),
     ],
 )
 def test_advance_equals_host_iterations(algorithm, method, begin, monkeypatch):

@@ -123,6 +123,7 @@ def test_seeds_do_not_depend_on_each_other(dense, dense_run, tmp_path):
     assert len({line["evaluation/return"] for line in other_run.metrics()}) == 4
 
 
+@pytest.mark.long
 def test_infinite_factor_stops_run(small, factor_run, phi, tmp_path, monkeypatch):
     collect = HostCollector.collect
 

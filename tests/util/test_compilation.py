@@ -64,6 +64,7 @@ def test_incomplete_programs_are_removed(tmp_path):
     assert {file.name for file in directory.iterdir()} == {"good-cache", "good-atime", ".lockfile"}
 
 
+@pytest.mark.long
 def test_enable_cache_after_a_compilation(tmp_path):
     environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     environment["LARE_CACHE"] = str(tmp_path)
