@@ -11,7 +11,7 @@ references too. A task has a share if its gap is larger than two standard errors
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -115,8 +115,7 @@ COMPARISONS = {
     "wheat, SAC": simulator("Wheat", "sac", 6_000),
     "traffic, PPO": simulator("Traffic", "ppo", 36_000, WHOLE_EPISODE),
     "job shop, PPO": simulator("JobShop", "ppo", 100_000, WHOLE_EPISODE, WHOLE_EPISODE),
-    # LaRe as published and the proxy are not trained yet.
-    "power grid, PPO": replace(simulator("Grid", "ppo", 30_720), paper=(), dense=()),
+    "power grid, PPO": simulator("Grid", "ppo", 30_720),
     "trains, IPPO": simulator("Trains", "ippo", 60_000),
     f"{HALF_CHEETAH}, TD3, short": Comparison(
         30_000,
