@@ -75,7 +75,7 @@ def test_codes(changes, factors, raw_features, codes):
 
 def test_shares_groups_and_missing_pairs():
     values = find({}, raw_features=RAW_FEATURES)[0].values
-    assert (values["share"], values["target"]) == (0.9, Finding("returns", {"n_episodes": 40}))
+    assert (values["share"], values["target"]) == (0.9, Finding("returns", {"n_episodes": 40, "groups": None}))
     assert values["raw"].values["share"] == pytest.approx(0.07)
     assert find({"total_r2": 0.909}, raw_features=RAW_FEATURES)[0].values["raw"] is None
     changes = {"raw_feature_shares": np.array([0.2, 0.77]), "explains_mean_reward": True}
@@ -91,6 +91,8 @@ def test_shares_groups_and_missing_pairs():
     (finding,) = (finding for finding in find({}, groups=effects) if finding.code == "groups_differ")
     assert [group.values["name"] for group in finding.values["groups"]] == [f"map {i}" for i in range(10, 2, -1)]
     assert finding.values["more"].values == {"count": 2}
+    target = find({}, groups={"easy": 2.0}, only_at_end=False)[1].values["target"]
+    assert target == Finding("payments", {"n_episodes": 40, "groups": Finding("with_groups")})
     missing = find({}, (), RAW_FEATURES, lacks_pairs=True)[-1]
     assert missing == Finding("products_not_read", {"n_raw": 2, "most": 12})
 
@@ -99,8 +101,10 @@ def test_score_type():
     types = {ScoreType.SUM: Finding("sum"), ScoreType.AVERAGE: Finding("mean")}
     for score_type, rival in ((ScoreType.SUM, ScoreType.AVERAGE), (ScoreType.AVERAGE, ScoreType.SUM)):
         for is_certain, code in ((True, "score_type_is_certain"), (False, "score_type_is_uncertain")):
-            finding = find({}, score_type=ScoreTypeEstimate(score_type, is_certain, rival))[0]
-            assert finding == Finding(code, {"this": types[score_type], "other": types[rival]})
+            estimate, values = ScoreTypeEstimate(score_type, is_certain, rival), {"this": types[score_type]}
+            for is_binary, advice in ((False, Finding("set_score_type")), (True, None)):
+                finding = find({}, score_type=estimate, is_binary=is_binary)[0]
+                assert finding == Finding(code, values | {"other": types[rival], "advice": advice})
         finding = find({}, score_type=ScoreTypeEstimate(score_type, is_certain=True, rival=ScoreType.LOG_ODDS))[0]
         assert finding == Finding("score_is_not_log_odds", {"this": types[score_type]})
 
@@ -160,7 +164,8 @@ def test_messages_and_lines():
         **dict.fromkeys(("share", "slope", "std", "correlation", "value"), 0.5),
         **dict.fromkeys(("this", "other", "target", "largest", "features", "name", "names", "raw"), "x"),
         **dict.fromkeys(("effect", "groups", "n_episodes", "n_unused", "n_raw", "most", "count"), 3),
-        **dict.fromkeys(("more", "states", "shape", "before", "after", "scored_observation"), None),
+        **dict.fromkeys(("more", "states", "shape", "before", "after", "scored_observation", "advice"), None),
+        "unit": "x",
     }
     for code in MESSAGES:
         text = render(Finding(code, values), MESSAGES)

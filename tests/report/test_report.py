@@ -296,7 +296,8 @@ def test_settings_of_a_run(make_run, tmp_path):
 
 
 def test_texts_and_tables(make_run, monkeypatch, tmp_path):
-    finding = Finding("score_type_is_certain", {"this": Finding("sum"), "other": Finding("mean")})
+    values = {"this": Finding("sum"), "other": Finding("mean"), "advice": Finding("set_score_type")}
+    finding = Finding("score_type_is_certain", values)
     monkeypatch.setattr(run_details, "find_explanations", lambda run: [[finding]])
     text = "".join(run_details._render_earnings(make_run("a", [1.0]), [np.zeros(0)]))
     assert "<code>--credit.score</code>" in text

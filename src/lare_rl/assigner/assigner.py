@@ -265,6 +265,8 @@ class CreditAssigner:
     ) -> Float[np.ndarray, "n *agents"]:
         """Return r_hat of any steps by the newest decoder: (n,), for many agents (n, agents). The steps are not stored.
 
+        `exact` does not correct them, because their returns are not known: `rewards_at` is corrected.
+
         `length` is T of each step's episode, (n,): if a score is an average over steps, r_hat is divided by T. The default is the mean
         length of the episodes so far. `begins`, (n,), is true for the first step of each episode, if the steps are those of whole
         episodes, in order. Only methods that read the history of an episode need it.

@@ -27,7 +27,15 @@ def describe_returns(learner: DecoderLearner, group_names: Iterable[Hashable]) -
         return []
     factor_names = [] if config.phi is None else config.phi.factor_columns(config.scored_observation)
     raw_names = config.raw_feature_names
-    findings = returns_findings(explanation, decoder, config.spec, factor_names, raw_names, group_names)
+    findings = returns_findings(
+        explanation,
+        decoder,
+        config.spec,
+        factor_names,
+        raw_names,
+        group_names,
+        only_at_end=config.payments.only_at_end,
+    )
     return [render(finding, MESSAGES) for finding in findings]
 
 

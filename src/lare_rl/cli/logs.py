@@ -25,7 +25,7 @@ def relabel(
     seed: int = 0,
     overwrite: bool = False,
 ) -> None:
-    """Give the steps of logged episodes rewards that add up to the episodes' returns, and report how well they predict returns.
+    """Give the steps of logged episodes rewards that are fitted to the episodes' returns, and report how well they predict returns.
 
     Writes the same data with the new rewards; the old rewards are kept beside them, as `paid`. No simulator is needed
     (docs/tutorials/your-own-logs.md).
@@ -34,8 +34,9 @@ def relabel(
         dataset: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, or the id of a local
             Minari data set.
         out: the path to write, or the id of the new Minari data set. It is written whole or not at all.
-        task: a shipped name (see `lare-rl tasks`), or the path of a task file: the task that --function was designed for. The time
-            limit and the number of discrete actions are taken from it. Its environment is not created.
+        task: a shipped name (see `lare-rl tasks`), or the path of a task file: the task that --function was designed for. It says
+            how an episode is paid (docs/how-to/scores.md), and has the time limit and the number of discrete actions. Its environment
+            is not created.
         function: a latent function (.py), verified on steps of the data before it is run.
         method: how credit is assigned (see `lare-rl methods`); the default is lare-bayes with --function, bayes without.
         hold_out: share of the episodes that are kept out of the fit, to measure how well returns are predicted.

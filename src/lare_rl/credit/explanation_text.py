@@ -40,11 +40,8 @@ STRIKING_CORRELATION = 0.3
 N_LARGEST, N_UNUSED, N_GROUPS = 3, 12, 8
 """This many raw features with large shares, unused raw features, and groups of episodes are named."""
 
-_WHERE_TO_SET = "in the task file, `--credit.score`, or `CreditSettings(score=...)`."
+_WHERE_TO_SET = "in the task file (in training also by `--credit.score`, in Python by `CreditSettings(score=...)`)."
 _TREATED_AS = "The score is treated as {this} over the steps of an episode"
-_SET_SCORE_TYPE = (
-    f'This may change. If you know which it is, set it: `score = "sum"` or `score = "average"` {_WHERE_TO_SET}'
-)
 _HIGH = (
     "Returns are higher than the factors predict when {{name}} is {size} (correlation {{correlation:+.2f}}): a factor may be "
     "missing{{scored_observation}}."
@@ -55,8 +52,9 @@ MESSAGES = {
         "There is nothing to explain: all episodes have the same return or, if the score is a sum, the same mean reward of a "
         "step."
     ),
-    "score_type_is_certain": (f"{_TREATED_AS}, which so far predicts returns better than {{other}}. {_SET_SCORE_TYPE}"),
-    "score_type_is_uncertain": (f"{_TREATED_AS}: so far, {{other}} predicts returns about as well. {_SET_SCORE_TYPE}"),
+    "score_type_is_certain": f"{_TREATED_AS}, which so far predicts returns better than {{other}}. This may change.{{advice}}",
+    "score_type_is_uncertain": f"{_TREATED_AS}: so far, {{other}} predicts returns about as well. This may change.{{advice}}",
+    "set_score_type": f' If you know which it is, set it: `score = "sum"` or `score = "average"` {_WHERE_TO_SET}',
     "score_is_log_odds": (
         "Steps are paid for what they add to the log odds of the higher score, which so far predicts returns better than a sum. "
         "The shares and effects below are those of a sum."
@@ -72,8 +70,12 @@ MESSAGES = {
     "group_effect": "{value:+.3g} in group {name}",
     "sum": "a sum",
     "mean": "an average",
-    "returns": "the returns of {n_episodes:,} episodes",
-    "mean_rewards": "the mean reward of a step in {n_episodes:,} episodes",
+    "returns": "the returns of {n_episodes:,} episodes{groups}",
+    "payments": "{n_episodes:,} payments{groups}",
+    "mean_rewards": "the mean reward of a step in {n_episodes:,} {unit}{groups}",
+    "episodes": "episodes",
+    "stretches": "stretches between payments",
+    "with_groups": ", in which the groups count too",
     "raw_features_explain": "Raw entries explain {share:.0%} of the variation of {target}.{largest}",
     "largest": " The largest shares: {features}.",
     "feature_share": "{name} {share:.0%}",
@@ -130,10 +132,14 @@ def returns_findings(
     factor_names: Sequence[str],
     raw_names: Sequence[str],
     group_names: Iterable[Hashable],
+    *,
+    only_at_end: bool,
 ) -> list[Finding]:
     """Return what `explanation_findings` says about returns: by an explanation, and by the decoder that was fitted to them.
 
-    `group_names` are the names of the first levels, or of all.
+    Args:
+        group_names: the names of the first levels, or of all.
+        only_at_end: whether an episode is paid once; else each payment is a return of its own.
     """
     effects = decoder_state.level_effects(decoder, float(explanation.mean_length), spec.basis.n_levels).tolist()
     return explanation_findings(
@@ -142,6 +148,8 @@ def returns_findings(
         factor_names,
         raw_names,
         looks_binary=learning.looks_binary(decoder, spec),
+        is_binary=ScoreType.LOG_ODDS in spec.score_types,
+        only_at_end=only_at_end,
         start_value=_noticeable_start_value(decoder) if spec.basis.start_value else 0.0,
         groups=dict(zip(group_names, effects, strict=False)),
         lacks_pairs=spec.method.decoder_kind.extended_basis and len(raw_names) > MAX_PAIRED_RAW_FEATURES,
@@ -155,6 +163,8 @@ def explanation_findings(
     raw_features: Sequence[str],
     *,
     looks_binary: bool = False,
+    is_binary: bool = False,
+    only_at_end: bool = True,
     start_value: float = 0.0,
     groups: Mapping[Any, float] | None = None,
     lacks_pairs: bool = False,
@@ -166,6 +176,8 @@ def explanation_findings(
         factors: names of the factors; empty for a method without factors.
         raw_features: names of the raw features; empty if they have none. Then nothing is said of single features.
         looks_binary: `learning.looks_binary`.
+        is_binary: whether the score is set to be won or lost.
+        only_at_end: whether an episode is paid once.
         start_value: what each episode returns beside its steps (`decoder_state.start_value`).
         groups: what an episode of each group returns beside its steps (`decoder_state.level_effects`), by the group's name.
         lacks_pairs: whether there are too many raw features for pairs of them.
@@ -175,9 +187,14 @@ def explanation_findings(
         return []
     if not np.isfinite(explanation.total_r2):
         return [Finding("equal_returns")]
-    target = Finding("mean_rewards" if explanation.explains_mean_reward else "returns", {"n_episodes": n_episodes})
+    target_code = "returns" if only_at_end else "payments"
+    values = {"n_episodes": n_episodes, "groups": Finding("with_groups") if any((groups or {}).values()) else None}
+    if explanation.explains_mean_reward:
+        target_code = "mean_rewards"
+        values["unit"] = Finding("episodes" if only_at_end else "stretches")
+    target = Finding(target_code, values)
     largest = _largest_raw_features(explanation, raw_features)
-    findings = [] if score_type is None else [_score_type(score_type)]
+    findings = [] if score_type is None else [_score_type(score_type, is_binary=is_binary)]
     findings += [Finding("looks_binary")] if looks_binary else []
     findings += [Finding("start_value", {"value": start_value})] if start_value else []
     findings += _groups(groups or {})
@@ -231,7 +248,7 @@ def _unused_raw_features(explanation: Explanation, names: Sequence[str]) -> list
     return [Finding("unused_raw_features", {**values, "more": _more(len(unused) - N_UNUSED)})]
 
 
-def _score_type(estimate: ScoreTypeEstimate) -> Finding:
+def _score_type(estimate: ScoreTypeEstimate, *, is_binary: bool) -> Finding:
     if estimate.score_type is ScoreType.LOG_ODDS:
         return Finding("score_is_log_odds")
     this = Finding("sum" if estimate.score_type is ScoreType.SUM else "mean")
@@ -239,7 +256,7 @@ def _score_type(estimate: ScoreTypeEstimate) -> Finding:
         return Finding("score_is_not_log_odds", {"this": this})
     other = Finding("sum" if estimate.rival is ScoreType.SUM else "mean")
     code = "score_type_is_certain" if estimate.is_certain else "score_type_is_uncertain"
-    return Finding(code, {"this": this, "other": other})
+    return Finding(code, {"this": this, "other": other, "advice": None if is_binary else Finding("set_score_type")})
 
 
 def _largest_raw_features(explanation: Explanation, names: Sequence[str]) -> tuple[Finding, ...]:

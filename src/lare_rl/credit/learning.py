@@ -231,4 +231,9 @@ def looks_binary(state: DecoderState, spec: CreditSpec) -> bool:
     if spec.method.fit is not Fit.EVIDENCE or ScoreType.LOG_ODDS in spec.score_types:
         return False
     n_returns = min(int(state.predictions.n_episodes), len(state.predictions.returns))
-    return n_returns >= MIN_BINARY_RETURNS and len(np.unique(np.asarray(state.predictions.returns)[:n_returns])) == 2
+    returns = np.sort(np.asarray(state.predictions.returns)[:n_returns])
+    if n_returns < MIN_BINARY_RETURNS or returns[0] == returns[-1]:
+        return False
+    # A return is stored as the mean reward of a step, so equal returns of unlike lengths differ in their last digits.
+    gaps = np.diff(returns) > 1e-5 * max(abs(returns[0]), abs(returns[-1]))
+    return int(gaps.sum()) == 1

@@ -49,6 +49,7 @@ MESSAGES = {
     "{correlation:.2f}.",
     "r2": "The returns of {episodes:count episode} held out of the fit are predicted with an R² of {r2:r2}, with a standard error "
     "of {error:error}.",
+    "within_groups": "Within their groups, the R² is {r2:r2}.",
     "worthless": "Warning: that is no better than their mean. Do not train on these rewards.",
 }
 """The sentences of `Relabelled.findings`."""
@@ -73,6 +74,8 @@ class Relabelled:
     """R^2 of their returns. NaN for fewer than `MIN_R2_EPISODES`, for equal returns, or if r_hat is not in the unit of returns."""
     return_r2_error: float
     """The standard error of `return_r2` over these episodes."""
+    group_r2: float
+    """R^2 of the differences of these returns from the means of their groups. NaN without groups, and with too few returns."""
     return_correlation: float
     """Pearson's correlation of these returns with their predictions. NaN for fewer than `MIN_R2_EPISODES`, or if one never varies."""
     explanation: tuple[str, ...]
@@ -96,7 +99,9 @@ class Relabelled:
             yield Finding("too_few", {**episodes, "needed": MIN_R2_EPISODES})
         elif not math.isnan(self.return_r2):
             yield Finding("r2", {**episodes, "r2": self.return_r2, "error": self.return_r2_error})
-            if self.return_r2 < LITTLE_R2:
+            if not math.isnan(self.group_r2):
+                yield Finding("within_groups", {"r2": self.group_r2})
+            if self.return_r2 < LITTLE_R2 or self.group_r2 < LITTLE_R2:  # false for NaN
                 yield Finding("worthless")
         elif math.isnan(self.return_correlation):
             yield Finding("constant", episodes)
@@ -112,6 +117,19 @@ def predicted_return_statistics(returns: Sequence[float], predictions: Sequence[
     r2, error = r_squared(y, predicted)
     varies = all(np.ptp(values) > FLOAT32_NOISE * np.abs(values).max() for values in (y, predicted))
     return r2, error, correlation(y, predicted) if varies else math.nan
+
+
+def _r2_within_groups(returns: Sequence[float], predictions: Sequence[float], groups: Sequence[Any]) -> float:
+    """Return R^2 of what differs within groups. NaN for fewer than `MIN_R2_EPISODES` in groups of two or more."""
+    members = [np.flatnonzero([group == other for other in groups]) for group in dict.fromkeys(groups)]
+    members = [rows for rows in members if len(rows) > 1]
+    if sum(map(len, members)) < MIN_R2_EPISODES:
+        return math.nan
+    values = np.array([returns, predictions])
+    y, predicted = np.concatenate(
+        [values[:, rows] - values[:, rows].mean(axis=1, keepdims=True) for rows in members], 1
+    )
+    return r_squared(y, predicted)[0]
 
 
 def relabel(
@@ -192,8 +210,9 @@ def relabel(
     comment = f"Rewards by lare-rl relabel, {name}; the old rewards are in infos['paid'], after an entry for the reset."
     path = log.write(out, episodes, overwrite, comment)
     r2, r2_error, return_correlation = predicted_return_statistics(counts.returns, counts.predictions)
+    group_r2 = _r2_within_groups(counts.returns, counts.predictions, counts.groups)
     if not credit.config.method.calibrated:
-        r2 = r2_error = math.nan
+        r2 = r2_error = group_r2 = math.nan
     return Relabelled(
         out=path,
         method=name,
@@ -203,6 +222,7 @@ def relabel(
         held_out=len(counts.returns),
         return_r2=r2,
         return_r2_error=r2_error,
+        group_r2=group_r2,
         return_correlation=return_correlation,
         explanation=explanation,
     )
@@ -232,6 +252,8 @@ class _Counts:
     """True returns of the held-out episodes."""
     predictions: list[float] = field(default_factory=list)
     """Their predicted returns."""
+    groups: list[Any] = field(default_factory=list)
+    """Their groups; empty without groups."""
 
 
 def _fit(
@@ -297,6 +319,8 @@ def _compute_rewards(
                 counts.returns.append(float(episode.reward.sum()))
                 level = None if episode.group is None else credit.group_names.get(episode.group)
                 counts.predictions.append(credit.step_rewards.predicted_return(predicted, level, payments.length))
+                if episode.group is not None:
+                    counts.groups.append(episode.group)
             if episode.complete and credit.config.spec.is_exact:
                 residual = np.add.reduceat(episode.reward, payments.end - payments.n_since_last) - predicted
                 r_hat = make_exact(r_hat, residual, payments, credit.config.settings)

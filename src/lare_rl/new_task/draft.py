@@ -32,8 +32,8 @@ SCORED_OBSERVATION_LINE = (
     '"both"'
 )
 SCORE_LINE = (
-    '# score = "average" # only if episodes differ in length. "sum": steps or events add up; '
-    '"average": how good steps were on average'
+    '# score = "average" # if episodes differ in length. "sum": steps or events add up; "average": how good steps were on average. '
+    '"binary": won or lost'
 )
 MEASURES_LINE = '# measures = ["distance"] # keys of the last step\'s info to report beside the return'
 GROUP_LINE = (

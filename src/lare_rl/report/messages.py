@@ -88,7 +88,7 @@ MESSAGES = {
         "In single steps, proxy and true rewards correlate with {correlation:.2f} and differ by {error:number} on average. Returns "
         "are sums over episodes: several rewards of single steps may give the same sums."
     ),
-    "score_use": "The score was taken as {form}{period}{groups}{exact}. {trust}",
+    "score_use": "The score was taken as {form}{period}{window}{groups}{exact}. {trust}",
     "form_sum": "a sum over the steps",
     "form_mean": "an average over the steps",
     "form_log_odds": "won or lost, by the log odds that steps add",
@@ -96,6 +96,7 @@ MESSAGES = {
     "form_progress": "the sum of the changes of its expected value",
     "period": ", paid every {period} steps",
     "period_nonzero": ", paid with every reward that is not 0",
+    "paid_for": ", for the last {steps} steps",
     "with_groups": ", with an intercept for each group of episodes",
     "exact_last": "; the rest of the return is added to the reward of the last step",
     "exact_spread": "; the rest of the return is spread evenly over the steps",

@@ -24,6 +24,8 @@ class ScoreUse:
     is_binary: bool = False
     period: int | str | None = None
     """When the environment pays before the end of an episode: the number of steps, or "nonzero"."""
+    window: int | None = None
+    """The number of steps that a payment is for, if the task file names it."""
     has_groups: bool = False
     """Whether each group of episodes has its own intercept."""
     exact: str = "no"
@@ -49,13 +51,14 @@ class ScoreUse:
         chance = Finding("chance_remains") if self.is_binary and code == "trust_part" else None
         values = {"gain": self.gain, "error": self.gain_error, "baseline": baseline, "chance": chance}
         trust = Finding(code, values)
-        is_plain = self.period is None and not self.has_groups and self.exact == "no"
+        is_plain = self.period is None and self.window is None and not self.has_groups and self.exact == "no"
         if self.equal_lengths and self.form in ("form_sum", "form_mean") and is_plain:
             return trust
         period_code = "period_nonzero" if self.period == "nonzero" else "period"
         how = {
             "form": Finding(self.form),
             "period": Finding(period_code, {"period": self.period}) if self.period else None,
+            "window": Finding("paid_for", {"steps": self.window}) if self.window else None,
             "groups": Finding("with_groups") if self.has_groups else None,
             "exact": None if self.exact == "no" else Finding(f"exact_{self.exact}"),
         }
@@ -87,6 +90,7 @@ def summarise_score_use(
         form=form,
         is_binary=settings.credit.score == "binary",
         period=None if task.payments == "end" else task.payments,
+        window=task.payment_rule.window,
         has_groups=task.group is not None,
         exact=settings.credit.exact if settings.credit.exact in ("last", "spread") else "no",
         equal_lengths=equal_lengths,

@@ -17,7 +17,8 @@ class PaymentRule:
     nonzero: bool = False
     """Every reward that is not 0 is a payment."""
     window: int | None = None
-    """A payment is for this number of last steps of its episode. None means all steps since the last payment."""
+    """A payment is for this number of last steps of its episode, the one that is paid included. None means all steps since the last
+    payment."""
 
     def __post_init__(self) -> None:
         for name in ("period", "window"):

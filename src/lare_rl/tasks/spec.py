@@ -77,7 +77,7 @@ class PaidSteps(CheckedModel):
     """The value of `paid_for` if each payment is for a fixed number of steps."""
 
     steps: Annotated[StrictInt, Field(ge=1)]
-    """A payment is for this many of the last steps."""
+    """A payment is for this many of the last steps, the one that is paid included."""
 
 
 class TaskSpec(CheckedModel):
@@ -115,7 +115,7 @@ class TaskSpec(CheckedModel):
     """When the environment pays: once, at the end of an episode; with every reward that is not 0; or every so many steps and at
     the end. Rewards between payments are added up."""
     paid_for: Literal["since_last"] | PaidSteps = "since_last"
-    """Steps that a payment is for: all since the last payment, or `{ steps = 20 }`, the last 20."""
+    """Steps that a payment is for: all since the last payment, or `{ steps = 20 }`, the last 20 with the one that is paid."""
     group: str | None = None
     """Key of `info` with the group of an episode, a whole number from 0 to 63: its level, map, weather or demand. Each group has
     an intercept, so that the steps of an easy level get no credit for its higher returns."""

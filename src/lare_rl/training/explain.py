@@ -75,7 +75,10 @@ def _find_explanations(run: Run, learner: Learner, config: TrainConfig) -> list[
         factor_names = run.functions[i].factor_columns(run.scored_observation) if run.functions else []
         raw_names = [] if config.team_level else fitted_specs[i].raw_feature_names(role.observation, role.action)
         decoder = select_seed(first_shard(learner.decoders[i]))
-        findings.append(returns_findings(explanation, decoder, spec, factor_names, raw_names, range(spec.n_levels)))
+        names, paid_once = range(spec.n_levels), run.config.task.payment_rule.only_at_end
+        findings.append(
+            returns_findings(explanation, decoder, spec, factor_names, raw_names, names, only_at_end=paid_once)
+        )
     return findings
 
 
