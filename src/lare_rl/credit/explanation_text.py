@@ -65,6 +65,10 @@ MESSAGES = {
     "looks_binary": (
         f'The last returns have only two values. If the score is won or lost, set it: `score = "binary"` {_WHERE_TO_SET}'
     ),
+    "not_binary": (
+        "The score is set to be won or lost, and the last returns have more than two values. Returns above the middle of the last "
+        "ones count as won."
+    ),
     "groups_differ": "Beside what its steps earn, an episode returns: {groups}{more}. No step is paid for this.",
     "start_value": "Beside what its steps earn, each episode returns {value:+.3g}. No step is paid for this.",
     "group_effect": "{value:+.3g} in group {name}",
@@ -147,7 +151,7 @@ def returns_findings(
         learning.estimate_score_type(decoder, spec),
         factor_names,
         raw_names,
-        looks_binary=learning.looks_binary(decoder, spec),
+        outcomes=learning.check_outcomes(decoder, spec),
         is_binary=ScoreType.LOG_ODDS in spec.score_types,
         only_at_end=only_at_end,
         start_value=_noticeable_start_value(decoder) if spec.basis.start_value else 0.0,
@@ -162,7 +166,7 @@ def explanation_findings(
     factors: Sequence[str],
     raw_features: Sequence[str],
     *,
-    looks_binary: bool = False,
+    outcomes: str | None = None,
     is_binary: bool = False,
     only_at_end: bool = True,
     start_value: float = 0.0,
@@ -175,7 +179,7 @@ def explanation_findings(
         score_type: None if it is set, or makes no difference.
         factors: names of the factors; empty for a method without factors.
         raw_features: names of the raw features; empty if they have none. Then nothing is said of single features.
-        looks_binary: `learning.looks_binary`.
+        outcomes: `learning.check_outcomes`.
         is_binary: whether the score is set to be won or lost.
         only_at_end: whether an episode is paid once.
         start_value: what each episode returns beside its steps (`decoder_state.start_value`).
@@ -195,7 +199,7 @@ def explanation_findings(
     target = Finding(target_code, values)
     largest = _largest_raw_features(explanation, raw_features)
     findings = [] if score_type is None else [_score_type(score_type, is_binary=is_binary)]
-    findings += [Finding("looks_binary")] if looks_binary else []
+    findings += [Finding(outcomes)] if outcomes else []
     findings += [Finding("start_value", {"value": start_value})] if start_value else []
     findings += _groups(groups or {})
     if not factors:

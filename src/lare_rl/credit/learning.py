@@ -11,6 +11,8 @@ All decoders predict returns. The sums are only needed for a fit in closed form.
 the type of the score.
 """
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,10 +31,10 @@ from lare_rl.credit.spec import CreditSpec
 __all__ = [
     "MIN_GROWTH",
     "add_to_sums",
+    "check_outcomes",
     "estimate_score_type",
     "fit_closed_form",
     "is_fitted",
-    "looks_binary",
     "mean_features",
     "predict",
     "predict_then_update",
@@ -226,14 +228,18 @@ def estimate_score_type(state: DecoderState, spec: CreditSpec) -> ScoreTypeEstim
     return compare_score_types(state.score_type_predictions, spec.score_types, index)
 
 
-def looks_binary(state: DecoderState, spec: CreditSpec) -> bool:
-    """Return whether the last returns have two values, and the method could fit their odds, but does not."""
-    if spec.method.fit is not Fit.EVIDENCE or ScoreType.LOG_ODDS in spec.score_types:
-        return False
+def check_outcomes(state: DecoderState, spec: CreditSpec) -> Literal["looks_binary", "not_binary"] | None:
+    """Return what is odd about the last returns: they have two values, and the score is not set to be won or lost; or the reverse.
+
+    None if nothing is, for few returns, and for a method that cannot fit log odds.
+    """
     n_returns = min(int(state.predictions.n_episodes), len(state.predictions.returns))
     returns = np.sort(np.asarray(state.predictions.returns)[:n_returns])
-    if n_returns < MIN_BINARY_RETURNS or returns[0] == returns[-1]:
-        return False
+    if spec.method.fit is not Fit.EVIDENCE or n_returns < MIN_BINARY_RETURNS or returns[0] == returns[-1]:
+        return None
     # A return is stored as the mean reward of a step, so equal returns of unlike lengths differ in their last digits.
     gaps = np.diff(returns) > 1e-5 * max(abs(returns[0]), abs(returns[-1]))
-    return int(gaps.sum()) == 1
+    has_two_values = int(gaps.sum()) == 1
+    if has_two_values == (ScoreType.LOG_ODDS in spec.score_types):
+        return None
+    return "looks_binary" if has_two_values else "not_binary"
