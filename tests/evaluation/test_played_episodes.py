@@ -1,5 +1,7 @@
 """Rollouts of runs whose agents leave, and whose episodes are paid several times."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
