@@ -18,10 +18,15 @@ def test_migrate_committed_runs():
         assert read_config(path.parent).format == FORMAT
 
 
-@pytest.mark.parametrize("number", [None, 1, FORMAT + 1, "3"])
+@pytest.mark.parametrize("number", [1, FORMAT + 1, "3"])
 def test_migrate_refuses_other_formats(number):
     with pytest.raises(LareError, match=r"another version.*\(0\.9\)"):
         migrate({"format": number, "lare": "0.9"})
+
+
+def test_migrate_refuses_a_file_without_a_format():
+    with pytest.raises(LareError, match="no 'format'"):
+        migrate({"lare": "0.9"})
 
 
 def test_migrate_through_all_formats():
