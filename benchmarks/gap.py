@@ -95,7 +95,7 @@ def simulator(task: str, algorithm: str, steps: int, episodic: str = "", dense: 
     """A simulator whose score exists only at the end. A dense proxy of the score takes the place of true rewards.
 
     Args:
-        episodic, dense: the endings of the references: of those that were trained, these score most.
+        episodic, dense: the endings of the runs of the two references. They name the setting with the highest scores.
     """
     return Comparison(
         steps,
@@ -289,35 +289,30 @@ def read_samples(comparisons: Sequence[Comparison], method: str) -> list[Sample]
 
 def estimate_share(comparisons: Sequence[Comparison], method: str) -> tuple[float, float, float]:
     """The interquartile mean of a method's shares, and its interval."""
-    random, samples = np.random.default_rng(0), read_samples(comparisons, method)
-    repeated = [
-        mean_share([Sample(*(resample(values, random) for values in samples[task])) for task in tasks])
-        for tasks in resample_tasks(len(samples), random)
-    ]
-    low, high = np.percentile(repeated, (2.5, 97.5))
+    samples = read_samples(comparisons, method)
+    low, high = np.percentile([share for (share,) in repeat_shares([samples])], (2.5, 97.5))
     return mean_share(samples), float(low), float(high)
 
 
 def estimate_difference(comparisons: Sequence[Comparison], method: str, other: str) -> tuple[float, float, float]:
-    """How much higher a method's interquartile mean is than that of another, and the interval. Both have the same references."""
-    random = np.random.default_rng(0)
-    pairs = list(zip(read_samples(comparisons, method), read_samples(comparisons, other), strict=True))
-    repeated = []
-    for tasks in resample_tasks(len(pairs), random):
-        samples: tuple[list[Sample], list[Sample]] = [], []
-        for pair in (pairs[task] for task in tasks):
-            episodic, dense = resample(pair[0].episodic, random), resample(pair[0].dense, random)
-            for sample, chosen in zip(pair, samples, strict=True):
-                chosen.append(Sample(resample(sample.method, random), episodic, dense))
-        repeated.append(mean_share(samples[0]) - mean_share(samples[1]))
-    low, high = np.percentile(repeated, (2.5, 97.5))
-    return mean_share([a for a, _ in pairs]) - mean_share([b for _, b in pairs]), float(low), float(high)
+    """How much higher a method's interquartile mean is than that of another, and the interval."""
+    samples = [read_samples(comparisons, name) for name in (method, other)]
+    low, high = np.percentile([share - base for share, base in repeat_shares(samples)], (2.5, 97.5))
+    return mean_share(samples[0]) - mean_share(samples[1]), float(low), float(high)
 
 
-def resample_tasks(n_tasks: int, random: np.random.Generator) -> Iterator[Sequence[int]]:
-    """Yield the tasks of each repetition."""
+def repeat_shares(methods: Sequence[Sequence[Sample]]) -> Iterator[list[float]]:
+    """Yield the mean share of each method in each repetition of the bootstrap, on the same tasks and with the same references."""
+    random, n_tasks = np.random.default_rng(0), len(methods[0])
     for _ in range(REPETITIONS):
-        yield [0] if n_tasks == 1 else random.integers(n_tasks, size=n_tasks).tolist()
+        tasks = [0] if n_tasks == 1 else random.integers(n_tasks, size=n_tasks).tolist()
+        repeated: list[list[Sample]] = [[] for _ in methods]
+        for task in tasks:
+            scores = [resample(samples[task].method, random) for samples in methods]
+            episodic, dense = (resample(values, random) for values in methods[0][task][1:])
+            for samples, values in zip(repeated, scores, strict=True):
+                samples.append(Sample(values, episodic, dense))
+        yield list(map(mean_share, repeated))
 
 
 def draw(rows: Mapping[str, Mapping[str, tuple[float, float, float]]]) -> str:

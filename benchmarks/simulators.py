@@ -107,23 +107,24 @@ def print_table(seeds: Runs) -> None:
         deterministic = last(runs, DETERMINISTIC)
         cells = [
             *(METHODS[method], str(len(runs))),
+            format_mean(mean_returns(runs)),
             *compare(mean_returns(runs), mean_returns(reference)),
             format_mean(last(runs, RETURN)),
             str(estimate(interquartile_mean, np.array(last(runs, RETURN))[:, None])),
-            *compare(last(runs, RETURN), last(reference, RETURN))[1:],
+            *compare(last(runs, RETURN), last(reference, RETURN)),
             format_mean(deterministic) if deterministic else "-",
         ]
         print(f"| {' | '.join(cells)} |")
 
 
-def compare(values: list[float], reference: list[float]) -> tuple[str, str, str]:
-    """Return mean and deviation, the difference to reference by seed, and p."""
+def compare(values: list[float], reference: list[float]) -> tuple[str, str]:
+    """Return the difference to reference by seed, and p. Both are empty for the reference itself."""
     if values == reference:
-        return format_mean(values), "", ""
+        return "", ""
     difference = np.subtract(values, reference[: len(values)])
     error, p = np.std(difference, ddof=1) / np.sqrt(len(difference)), float(np.asarray(wilcoxon(difference))[1])
     p_text = f"{p:.2g}".lstrip("0") if p >= 0.001 else "< .001"
-    return format_mean(values), f"{np.mean(difference):.2f} ± {error:.2f}", p_text
+    return f"{np.mean(difference):.2f} ± {error:.2f}", p_text
 
 
 def format_mean(values: list[float]) -> str:

@@ -99,13 +99,13 @@ def test_prefixes_are_summed_like_separate_cases():
         ("rd", "auto", 2, None),  # a gradient decoder cannot fit log odds
     ],
 )
-def test_check_outcomes(method, score, n_values, expected):
+def test_find_score_mismatch(method, score, n_values, expected):
     spec = observation_spec(2, METHODS[method], CreditSettings(score=score, hidden=(4,)), 4, fixed_length=False)
     number = jnp.arange(WINDOW)
     returns = (number % n_values) * (1 - (number % 3) * 6e-8)  # rounded, as R / T * T
     predictions = Predictions(jnp.float32(WINDOW), returns, returns[:, None], jnp.zeros(WINDOW, jnp.int32))
     state = init(jax.random.key(0), spec)._replace(predictions=predictions)
-    assert learning.check_outcomes(state, spec) == expected
+    assert learning.find_score_mismatch(state, spec) == expected
 
 
 def test_the_rival_of_a_sum_may_be_the_log_odds():

@@ -228,17 +228,20 @@ def test_predicted_return_statistics():
         ({"return_correlation": math.nan, "return_r2": -0.01}, ["r2", "worthless"]),  # equal predictions
         ({"return_r2": math.nan}, ["correlation"]),
         ({"return_r2": 0.09}, ["r2", "worthless"]),
-        (
-            {"group_r2": 0.05},
-            ["r2", "within_groups", "worthless"],
-        ),  # the groups explain the returns, and the steps nothing
+        # The groups explain the returns, and the steps nothing.
+        ({"group_r2": 0.05}, ["r2", "within_groups", "worthless"]),
         ({"cut": 3}, ["cut", "r2"]),
     ],
 )
 def test_findings(changes, expected):
     values = {"episodes": 1, "steps": 1000, "cut": 0, "held_out": 8, "return_r2": 0.9954, "return_r2_error": 0.0004}
-    values |= {"group_r2": math.nan}
-    values |= {"out": "new", "method": "rd", "return_correlation": 0.99, "explanation": ("Because.",)}
+    values |= {
+        "out": "new",
+        "method": "rd",
+        "return_correlation": 0.99,
+        "explanation": ("Because.",),
+        "group_r2": math.nan,
+    }
     result = Relabelled(**(values | changes))
     assert codes(result) == ["relabelled", *expected]
     assert result.summary == [*(render(finding, MESSAGES) for finding in result.findings), "Because."]

@@ -18,6 +18,8 @@ from lare_rl.training.saved_state import load_learner
 SOURCE = "def evaluation_func(o, a):\n    return [o[:, 0:1] * a[:, 0:1], o[:, 1:2]]\n"
 SHARES = "of the variation of the returns of"
 
+pytestmark = pytest.mark.long
+
 
 def check_explanation(run, messages):
     method, lines = run.config.settings.method, explain_run(run)
@@ -34,12 +36,10 @@ def check_explanation(run, messages):
     assert "<li" in bars
 
 
-@pytest.mark.long
 def test_explain_run(learned_training):
     check_explanation(*learned_training)
 
 
-@pytest.mark.long
 def test_explanation_is_compiled_from_shapes(learned_training):
     """As a thread does while steps are collected. The first explanation then compiles nothing."""
     run, _ = learned_training
@@ -51,7 +51,6 @@ def test_explanation_is_compiled_from_shapes(learned_training):
     assert compiled == []
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("method", ["lare-rd", "rrdu"])
 def test_explain_run_with_gradient(method, small, tmp_path):
     function, listener = verify_function(SOURCE, toy_spec()) if method == "lare-rd" else None, MessageListener()
@@ -59,7 +58,6 @@ def test_explain_run_with_gradient(method, small, tmp_path):
     check_explanation(train_quietly(toy_spec(), settings, tmp_path / "run", function, [listener]), listener.messages)
 
 
-@pytest.mark.long
 def test_explain_run_of_many_agents(small_many, tmp_path):
     """The score of many agents is explained by factors alone."""
     settings = small_many(method="lare-rd", seeds=1, steps=800, capacity=2000)

@@ -13,7 +13,7 @@ from tyro.conf import Positional
 from lare_rl.cli.terminal import RunDirectories, print_line, print_progress, print_table
 from lare_rl.errors import LareError
 from lare_rl.runs.metric_names import RETURN
-from lare_rl.sweep.resources import Resources
+from lare_rl.sweep.resources import Resources, assign_slots
 
 _BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
 """A directory of the checkout. It does not exist if LaRe was installed from a package index."""
@@ -37,7 +37,6 @@ def sweep(
     from lare_rl.cli.sweep_progress import current_step, show_progress
     from lare_rl.compare.metric_tables import read_metric_rows, write_table
     from lare_rl.config.effective import warmup_warning
-    from lare_rl.sweep.resources import assign_slots
     from lare_rl.sweep.sweep import read_sweep, run_sweep
 
     resources, jobs = read_sweep(file)

@@ -151,7 +151,7 @@ def returns_findings(
         learning.estimate_score_type(decoder, spec),
         factor_names,
         raw_names,
-        outcomes=learning.check_outcomes(decoder, spec),
+        score_mismatch=learning.find_score_mismatch(decoder, spec),
         is_binary=ScoreType.LOG_ODDS in spec.score_types,
         only_at_end=only_at_end,
         start_value=_noticeable_start_value(decoder) if spec.basis.start_value else 0.0,
@@ -166,7 +166,7 @@ def explanation_findings(
     factors: Sequence[str],
     raw_features: Sequence[str],
     *,
-    outcomes: str | None = None,
+    score_mismatch: str | None = None,
     is_binary: bool = False,
     only_at_end: bool = True,
     start_value: float = 0.0,
@@ -179,7 +179,7 @@ def explanation_findings(
         score_type: None if it is set, or makes no difference.
         factors: names of the factors; empty for a method without factors.
         raw_features: names of the raw features; empty if they have none. Then nothing is said of single features.
-        outcomes: `learning.check_outcomes`.
+        score_mismatch: `learning.find_score_mismatch`.
         is_binary: whether the score is set to be won or lost.
         only_at_end: whether an episode is paid once.
         start_value: what each episode returns beside its steps (`decoder_state.start_value`).
@@ -191,15 +191,13 @@ def explanation_findings(
         return []
     if not np.isfinite(explanation.total_r2):
         return [Finding("equal_returns")]
-    target_code = "returns" if only_at_end else "payments"
     values = {"n_episodes": n_episodes, "groups": Finding("with_groups") if any((groups or {}).values()) else None}
+    target = Finding("returns" if only_at_end else "payments", values)
     if explanation.explains_mean_reward:
-        target_code = "mean_rewards"
-        values["unit"] = Finding("episodes" if only_at_end else "stretches")
-    target = Finding(target_code, values)
+        target = Finding("mean_rewards", values | {"unit": Finding("episodes" if only_at_end else "stretches")})
     largest = _largest_raw_features(explanation, raw_features)
     findings = [] if score_type is None else [_score_type(score_type, is_binary=is_binary)]
-    findings += [Finding(outcomes)] if outcomes else []
+    findings += [Finding(score_mismatch)] if score_mismatch else []
     findings += [Finding("start_value", {"value": start_value})] if start_value else []
     findings += _groups(groups or {})
     if not factors:

@@ -31,8 +31,8 @@ from lare_rl.credit.spec import CreditSpec
 __all__ = [
     "MIN_GROWTH",
     "add_to_sums",
-    "check_outcomes",
     "estimate_score_type",
+    "find_score_mismatch",
     "fit_closed_form",
     "is_fitted",
     "mean_features",
@@ -228,10 +228,11 @@ def estimate_score_type(state: DecoderState, spec: CreditSpec) -> ScoreTypeEstim
     return compare_score_types(state.score_type_predictions, spec.score_types, index)
 
 
-def check_outcomes(state: DecoderState, spec: CreditSpec) -> Literal["looks_binary", "not_binary"] | None:
-    """Return what is odd about the last returns: they have two values, and the score is not set to be won or lost; or the reverse.
+def find_score_mismatch(state: DecoderState, spec: CreditSpec) -> Literal["looks_binary", "not_binary"] | None:
+    """Return how the last returns disagree with the score that is set.
 
-    None if nothing is, for few returns, and for a method that cannot fit log odds.
+    "looks_binary": they have two values, and the score is not set to be won or lost. "not_binary": the reverse. None if they agree,
+    for few returns, and for a method that cannot fit log odds.
     """
     n_returns = min(int(state.predictions.n_episodes), len(state.predictions.returns))
     returns = np.sort(np.asarray(state.predictions.returns)[:n_returns])

@@ -83,14 +83,14 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
     steps, proxy_reward = read_rewards(learner, index)
     reward = np.asarray(steps.columns["reward"])
     newest = _read_newest(state.learner, config)
-    is_known = has_step_rewards(newest.columns["reward"], newest.last[..., None], True)
+    is_known = bool(has_step_rewards(newest.columns["reward"], newest.last[..., None]))
     return EpisodeCredit(
         reward=reward,
         proxy_reward=np.asarray(proxy_reward),
         uncertainty=_uncertainty(steps, learner.decoders[0], config),
         factors=np.asarray(steps.columns.get("factors", np.zeros((len(reward), 1, 0)))),
-        has_step_rewards=bool(is_known),
-        correlations=_factor_correlations(newest, config, bool(is_known)),
+        has_step_rewards=is_known,
+        correlations=_factor_correlations(newest, config, is_known),
     )
 
 

@@ -22,7 +22,7 @@ from lare_rl.training.decoder_inputs import compute_host_factors
 from lare_rl.training.episodes import predict_returns
 from lare_rl.training.evaluation import EpisodeBatch
 from lare_rl.training.learner import Learner, empty_replay, store_with_factors
-from lare_rl.training.rewards import rewards
+from lare_rl.training.rewards import has_step_rewards, rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.streams import Stream, episode_seed
@@ -177,7 +177,8 @@ def sample_steps(run: Run, actor: Any = None) -> list[TeamSample]:
     """Return steps of each team, from `N_SAMPLE_EPISODES` episodes of `play_run`."""
     played = play_run(run, N_SAMPLE_EPISODES, actor=actor, key=1)
     config, samples = played.config, []
-    is_known = bool(played.reward[:-1][played.mask[1:]].any())
+    last = played.mask & ~np.append(played.mask[1:], np.zeros_like(played.mask[:1]), axis=0)
+    is_known = bool(has_step_rewards(played.reward, last[..., None], played.mask[..., None]))
     steps = jax.tree.map(lambda leaf: np.asarray(leaf)[played.mask], played.steps)  # [steps ...]
     for team_index, role in enumerate(run.config.task.roles):  # its rows of all episodes, as if they were one
         rows = make_episode(role, config.env, steps.timestep, steps.env_action, steps.next_timestep)

@@ -280,8 +280,9 @@ def check_same_tasks(tasks: Iterable[tuple[Path, TaskSpec]]) -> None:
     """Raise `LareError` if two paths have different tasks of the same name."""
     first: dict[str, tuple[Path, str]] = {}
     for path, task in tasks:
-        other, digest = first.setdefault(task.name, (path, task.digest))
-        if digest != task.digest:
+        digest = task.digest
+        other, other_digest = first.setdefault(task.name, (path, digest))
+        if other_digest != digest:
             raise LareError(f"{path} and {other} have different tasks with the name {task.name}: show them separately")
 
 

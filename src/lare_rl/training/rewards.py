@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lare_rl.algorithms.batches import Metrics
@@ -93,7 +94,9 @@ def accuracy_metrics(
 
 
 def has_step_rewards(
-    reward: Float[Array, "*steps"], last: Bool[Array, "*steps"], mask: Bool[Array, "*steps"] | bool
+    reward: Float[Array | np.ndarray, "*#steps"],
+    last: Bool[Array | np.ndarray, "*#steps"],
+    mask: Bool[Array | np.ndarray, "*#steps"] | bool = True,
 ) -> Bool[Array, ""]:
     """Return whether the true rewards of single steps are known: a step that is not the last of an episode or a segment has one."""
     return jnp.any((reward != 0) & mask & ~last)
