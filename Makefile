@@ -17,9 +17,9 @@ endif
 
 .PHONY: demo test test-short test-families test-long check docs site setup constraints clean
 
-demo: $(VENV)/demo ## Train HalfCheetah on episodic rewards with recorded replies, draw the report, open it
+demo: $(VENV)/demo ## Train Reacher on episodic rewards with recorded replies, draw the report, open it
 	@if [ -e $(DEMO) ]; then $(BIN)/lare-rl train --resume $(DEMO); \
-	else $(BIN)/lare-rl train HalfCheetah-v4 --steps 40000 --out $(DEMO); fi
+	else $(BIN)/lare-rl train Reacher-v4 --steps 30000 --out $(DEMO); fi
 	@$(BIN)/lare-rl report $(DEMO)
 	@if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] || [ "$$(uname)" = Darwin ]; \
 	then $(BIN)/python -m webbrowser "file://$$PWD/$(DEMO)/report.html"; \
