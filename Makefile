@@ -5,6 +5,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 CONSTRAINTS ?= constraints.txt
 DEMO := runs/demo
+# Python may keep compiled modules: without them, each process takes some ten seconds to import JAX and this package.
+unexport PYTHONDONTWRITEBYTECODE
 
 PINS := $(addprefix --constraint ,$(CONSTRAINTS))
 ifneq ($(shell command -v uv),)

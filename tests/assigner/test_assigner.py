@@ -558,6 +558,7 @@ def test_must_learn_scores_that_are_no_sum(score):
         assert r_hat[raises].mean() > r_hat[~raises].mean() + 0.02
 
 
+@pytest.mark.long
 def test_must_learn_the_value_of_events_in_order():
     """A door opens only after the key is found. Key and door are paid when they happen, and each episode gets its return."""
     rng, credit = np.random.default_rng(0), small_assigner("bayes-progress")

@@ -25,9 +25,9 @@ def test_compare_by_hand(make_run):
     assert first.mean == pytest.approx(np.mean(values))
     assert first.std == pytest.approx(np.std(values, ddof=1))
     assert first.iqm.low <= first.iqm.value <= first.iqm.high
-    assert (first.improvement, first.difference, first.p_value) == (None, None, None)
+    assert (first.probability_of_improvement, first.difference, first.p_value) == (None, None, None)
     pairs = [(x + 0.5 > y) + 0.5 * (x + 0.5 == y) for x in values for y in values]
-    assert second.improvement.value == pytest.approx(np.mean(pairs))
+    assert second.probability_of_improvement.value == pytest.approx(np.mean(pairs))
     np.testing.assert_allclose(comparison.curves["dense"].x, [50, 100])
     np.testing.assert_allclose(comparison.curves["dense"].value, [3.5 / 2, 3.5])
     profile = comparison.profiles["dense"]
@@ -63,8 +63,8 @@ def test_tasks_without_common_scale(make_run):
     means = [(comparison.tasks, comparison.rows[0].mean) for comparison in comparisons]
     assert means == [(("Chase",), 2), (("Depot",), 200)]
     first, second = compare_over_tasks(comparisons)  # without rrd, which has fewer seeds on one of the tasks
-    assert (first.label, first.improvement, first.p_value) == ("dense", None, None)
-    assert (second.label, second.n_seeds, second.improvement.value) == ("rd", 3, 1)
+    assert (first.label, first.probability_of_improvement, first.p_value) == ("dense", None, None)
+    assert (second.label, second.n_seeds, second.probability_of_improvement.value) == ("rd", 3, 1)
     assert second.p_value == pytest.approx(1 / 200)
     assert compare_over_tasks(compare_tasks(read(runs[:2] + runs[4:]))) == []  # dense is not on Depot
     assert compare_over_tasks(comparisons[:1]) == []
@@ -78,7 +78,7 @@ def test_interval_of_difference(make_run, monkeypatch):
     runs = [make_run("a", [0.0, 10.0]), make_run("b", [100.0, 110.0], method="rd"), make_run("c", [1.0], method="rrd")]
     _, second, single = compare(read(runs)).rows
     assert second.difference == Estimate(100.0, 90.0, 110.0)
-    assert (single.difference, single.improvement, single.p_value) == (None, None, None)
+    assert (single.difference, single.probability_of_improvement, single.p_value) == (None, None, None)
     assert single.iqm == Estimate(1.0, 1.0, 1.0)
     (three,) = compare(read([make_run("d", [1.0, 2.0, 6.0])])).rows
     assert (three.iqm.low, three.iqm.high) == (1.0, 6.0)

@@ -81,8 +81,8 @@ def test_smallest_p(make_run):
     runs = [make_run("a", [1.0, 2.0]), make_run("b", [3.0, 4.0], method="rd"), make_run("c", [0.0, 0.5], method="rrdu")]
     comparison = compare(read(runs))
     _, better, worse = comparison.rows
-    assert (str(better.improvement), better.p_value) == ("1.000", pytest.approx(1 / 3))
-    assert (str(worse.improvement), worse.p_value) == ("0.000", pytest.approx(1 / 3))
+    assert (str(better.probability_of_improvement), better.p_value) == ("1.000", pytest.approx(1 / 3))
+    assert (str(worse.probability_of_improvement), worse.p_value) == ("0.000", pytest.approx(1 / 3))
     header, rows = comparison_table(comparison)
     assert (header[-1], rows[1][-1]) == ("p", "0.33")
     (finding,) = find_min_p(comparison)

@@ -84,6 +84,7 @@ def test_valid_rows_and_agents():
     assert decoder_state.agent_mean(values, alive).tolist() == [2.0]
 
 
+@pytest.mark.long
 def test_decoder_of_many_agents_soon_reaches_the_size_of_rare_rewards():
     """The reward of one in 200 steps of an agent is 10, and a factor says which. The mean reward is 0.05."""
     agents, steps, settings = 6, 25, CreditSettings(hidden=(64, 64, 64, 64), learning_rate=5e-4)

@@ -22,6 +22,7 @@ def sample_episodes(score="sum", count=60, agents=1, noise=0.0):
     return inputs, alive, returns
 
 
+@pytest.mark.long
 def test_r2_compares_factors_and_noise_has_no_score_type():
     inputs, alive, returns = sample_episodes()
     useless = [np.concatenate([episode[..., 3:5], episode[..., 2:]], axis=-1) for episode in inputs]

@@ -101,6 +101,7 @@ def test_pictures(environment, sizes, refusal):
             ["Entry 10 a + b: choice 1 is a, from 0 to 3; choice 2 is b, from 0 to 9."],
             ["discrete array", "Mask of"],
         ),
+        ("jumanji/GraphColoring-v1", (), ["An episode ends:\n- if all nodes"], ["Equals the negative"]),
     ],
 )
 def test_draft(environment, missing, words, absent):

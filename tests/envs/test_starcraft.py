@@ -30,7 +30,7 @@ def sample_actions(timestep, rng) -> np.ndarray:
 
 
 def test_episode_equals_smax():
-    env, (_, reset, step) = StarCraft("2s3z", make_game=FakeSmac), compiled_smax("2s3z")
+    env, (_, reset, step) = StarCraft("2s3z", make_env=FakeSmac), compiled_smax("2s3z")
     key, rng = jax.random.key(7), np.random.default_rng(0)
     timestep = env.reset(7)
     key, start_key = jax.random.split(key)
@@ -71,7 +71,7 @@ def test_time_limit(won):
             super().step(actions)
             return 1.0, True, {"battle_won": won}
 
-    env = StarCraft("2s3z", make_game=Ending)
+    env = StarCraft("2s3z", make_env=Ending)
     env.reset(0)
     env.spec = replace(env.spec, max_steps=1)
     timestep = env.step(STOP)
@@ -79,7 +79,7 @@ def test_time_limit(won):
 
 
 def test_crash_truncates_the_episode():
-    env = StarCraft("2s3z", make_game=partial(FakeSmac, crash_at=2))
+    env = StarCraft("2s3z", make_env=partial(FakeSmac, crash_at=2))
     env.reset(0)
     previous = env.step(STOP)
     with pytest.warns(RuntimeWarning, match="crashed in step 2"):
@@ -101,7 +101,7 @@ def test_repeated_crashes_end_the_run():
             self.ended = True
             return 0.0, True, next(infos)
 
-    env = StarCraft("2s3z", make_game=Ending)
+    env = StarCraft("2s3z", make_env=Ending)
     for seed in range(5):
         env.reset(seed)
         with nullcontext() if seed == 2 else pytest.warns(RuntimeWarning):
@@ -113,13 +113,13 @@ def test_repeated_crashes_end_the_run():
 
 def test_launches():
     """A new game is made only for the first episode, and again if that was incomplete."""
-    env, rng = StarCraft("2s3z", make_game=FakeSmac), np.random.default_rng(0)
+    env, rng = StarCraft("2s3z", make_env=FakeSmac), np.random.default_rng(0)
     timestep = env.reset(3)
     while not (timestep.terminated or timestep.truncated):
         timestep = env.step(sample_actions(timestep, rng))
     env.reset(4)
     assert FakeSmac.launched == (0, 3)
-    env = StarCraft("2s3z", make_game=FakeSmac)
+    env = StarCraft("2s3z", make_env=FakeSmac)
     env.reset(3)
     env.reset(4)
     assert FakeSmac.launched[2:] == (0, 3, 4)
@@ -129,7 +129,7 @@ def test_launches():
 
 
 def test_errors(write_package, monkeypatch, tmp_path):
-    env = StarCraft("2s3z", make_game=FakeSmac)
+    env = StarCraft("2s3z", make_env=FakeSmac)
     env.reset(0)
     with pytest.raises(LareError, match=r"in a step of '2s3z': .*not available"):
         env.step(np.eye(11, dtype=np.float32)[[0] * 5])
@@ -141,7 +141,7 @@ def test_errors(write_package, monkeypatch, tmp_path):
         raise KeyError("no map\n2s3y")
 
     with pytest.raises(LareError, match=r"cannot make '2s3y': .*no map") as error:
-        StarCraft("2s3y", make_game=fail)
+        StarCraft("2s3y", make_env=fail)
     assert "\n" not in str(error.value)
     write_package("smacv2")
     write_package("smacv2/env", "raise TypeError('Descriptors cannot\\nbe created directly')")

@@ -144,7 +144,7 @@ def test_normalised_buffer():
     sample = model.replay_buffer.sample(8, model.get_vec_normalize_env())
     np.random.seed(0)
     rows, env_indices = np.random.randint(0, 60, 8), np.random.randint(0, 2, 8)
-    expected = credit.rewards_at(model.replay_buffer.steps[rows, env_indices])
+    expected = credit.rewards_at(model.replay_buffer.step_ids[rows, env_indices])
     assert np.abs(expected).max() > 0
     np.testing.assert_array_equal(sample.rewards.numpy().ravel(), expected)
 
@@ -296,7 +296,7 @@ def test_full_buffer():
     credit = make_assigner(capacity=99)
     buffer = off_policy(make_envs(3)[0], credit, buffer_size=100).learn(250).replay_buffer
     assert buffer.full
-    assert buffer.steps.min() == credit.store.n_added - 99
+    assert buffer.step_ids.min() == credit.store.n_added - 99
     assert np.isfinite(buffer.sample(64).rewards.numpy()).all()
     options = {"optimize_memory_usage": True, "buffer_options": {"handle_timeout_termination": False}}
     buffer = off_policy(make_env(), make_assigner(), buffer_size=50, **options).learn(120).replay_buffer
@@ -313,6 +313,7 @@ def learn_with_callback(env, credit):
         (lambda: TD3("MlpPolicy", make_env(), replay_buffer_class=CreditReplayBuffer), "needs an assigner"),
         (lambda: off_policy(make_env(), make_assigner(capacity=99)), "capacity=300"),
         (lambda: learn_with_callback(make_env(), make_assigner(capacity=31)), "capacity=32"),
+        (lambda: off_policy(make_env(), 5), "CreditAssigner, and is 5"),
         (lambda: off_policy(make_env(), make_assigner(action_space=3)), "actions .* 1 numbers.* 3"),
         (lambda: off_policy(make_env(), make_assigner("rd", agents=2, max_steps=20)), "agents=2.* has 1"),
         (
@@ -325,17 +326,33 @@ def learn_with_callback(env, credit):
         ),
         (
             lambda: TD3("MlpPolicy", make_env(), **SMALL_BUFFER).learn(10, callback=CreditCallback(make_assigner())),
-            r"TD3\(\.\.\., replay_buffer_class=CreditReplayBuffer",
+            "TD3 has none.* replay_buffer_class=CreditReplayBuffer",
         ),
         (
             lambda: on_policy(make_env()).learn(32, callback=EveryNTimesteps(8, CreditCallback(make_assigner()))),
-            "saw 4 of the 32 steps",
+            "must see every step",
         ),
     ],
 )
 def test_bad_arguments(create, message):
     with pytest.raises(LareError, match=message):
         create()
+
+
+def test_learning_without_the_callback_after_an_interrupt():
+    class Interrupt(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 20:
+                raise KeyboardInterrupt
+            return True
+
+    credit, model = make_assigner(), on_policy(make_env())
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(64, callback=[CreditCallback(credit), Interrupt()])
+    model.learn(32)
+    assert len(credit.recorded) == 20
+    model.learn(32, callback=CreditCallback(credit), reset_num_timesteps=False)
+    assert len(credit.recorded) == 52
 
 
 def test_library_is_old(monkeypatch):

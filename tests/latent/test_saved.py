@@ -105,12 +105,26 @@ def test_header_in_a_reply(chase, path, top):
     assert (loaded.kind, loaded.source, loaded.changed) == ("factors", SOURCE, False)
 
 
+@pytest.mark.parametrize("top", ["\n", "# a note\n", "# a note\n\n"])
+def test_header_below_other_lines(chase, function, path, top):
+    function.save(path)
+    text = path.read_text()
+    path.write_text(top + text)
+    loaded = load_function(path, chase)
+    assert loaded.source == top.lstrip("\n") + SOURCE
+    assert loaded.changed == bool(top.strip())
+    path.write_text(top + text.replace("kind: factors", "kind: Reward"))
+    with pytest.raises(LareError, match=r"'Reward'.*factors or reward"):
+        load_function(path, chase)
+
+
 def test_names_of_files(function, tmp_path, monkeypatch):
     names = {"a": "a.py", "b.json": "b.py", "phi.v2": "phi.v2.py", "phi-0.5.py": "phi-0.5.py"}
     for name, file in names.items():
         function.save(tmp_path / name)
         assert (tmp_path / file).exists()
         assert (tmp_path / file).with_suffix(".json").exists()
+        assert read_source(tmp_path / name).source == function.source
     assert len(list(tmp_path.iterdir())) == 2 * len(names)
     monkeypatch.chdir(tmp_path)
     for path, words in (("none/phi.py", "cannot be written"), ("", "not the name"), ("..", "not the name")):
@@ -122,7 +136,7 @@ def test_names_of_files(function, tmp_path, monkeypatch):
     ("name", "content", "words"),
     [
         ("missing.py", None, r"missing\.py does not exist"),
-        ("missing.json", None, r"missing\.py does not exist"),
+        ("missing.json", None, r"missing\.json does not exist, nor missing\.py"),
         ("", None, "not a file"),
         ("phi.py", b"\xff", "0xff"),
         ("phi.py", b"#" * (2 << 20), "larger than 1 MB"),
@@ -148,5 +162,5 @@ def test_unreadable_file(chase, tmp_path, name, content, words):
 )
 def test_broken_record(chase, path, record):
     path.with_suffix(".json").write_text(record)
-    with pytest.raises(LareError, match=r"phi\.json is not the record of a latent function"):
+    with pytest.raises(LareError, match=r"phi\.json does not describe phi\.py"):
         load_function(path, chase)

@@ -341,9 +341,11 @@ def test_unsupported_options_are_dropped_for_good(start):
     ],
 )
 def test_bytes_are_counted_without_usage(start_either, usage):
+    """All bytes of the answer count, because it may hold reasoning that the reply does not show."""
     _, model, _ = start_either(reply_with("grüße", usage=usage))
     model.reply(REQUEST, 0)
-    assert (model.budget.tokens_in, model.budget.tokens_out) == (max_request_tokens(REQUEST), 7)
+    assert model.budget.tokens_in == max_request_tokens(REQUEST)
+    assert 50 < model.budget.tokens_out < 1000
     assert "bytes count" in model.budget.summary()
 
 

@@ -55,6 +55,7 @@ def test_linear_score(folder, tmp_path):
         assert all(np.array_equal(new[key], old[key]) for key in ("observations", "actions", "terminations"))
 
 
+@pytest.mark.long
 def test_groups_share_an_intercept(tmp_path):
     """Returns of the group "hard" are lower, and so is the second entry, which no step is paid for."""
     rows = []

@@ -38,6 +38,11 @@ EXPRESSIONS = """
     functools.reduce(operator.mul, [1, 2, 3, 4]) | operator.itemgetter(1)([5, 6]) | operator.truediv(1, 4) | operator.neg(3)
     len('a b c'.split(maxsplit=1)) | len({1}.union([2], [3])) | len({1, 2, 3}.difference([1], [2])) | len({1}.union()) | float('.5')
     sum(f() for f in [lambda: n for n in range(3)]) | sum(a * b for a, b in zip(*[iter([1, 2, 3, 4])] * 2)) | operator.lshift(1, 3)
+    len(list(itertools.repeat('ab', times=3))[0]) | len(list(itertools.repeat((1, 2, 3), 2))[1]) | len(list(itertools.zip_longest()))
+    len(list(itertools.permutations(range(9), 3))) | len(list(itertools.zip_longest([1], [2, 3], fillvalue=100)))
+    list(itertools.accumulate([1, 3, 2], func=max))[2] | sum(itertools.accumulate([1, 2], None)) | len(list(itertools.repeat('a', 2)))
+    'secret' in str({'path': ['secret.txt']}) | len(str({'a': (1,), 2: []})) | len(repr({1.5}))
+    len(list(itertools.product([1], repeat=0))) | len(f"{'a'!r}{set()}") | len(repr('a'))
     collections.OrderedDict([('a', 2)])['a'] | float('%.3f' % 1.23456) | float('{:.1f}'.format(2.25)) | float(f'{1.5:.2f}')
 """
 

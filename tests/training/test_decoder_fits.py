@@ -40,6 +40,7 @@ def stack_seeds(*seeds):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *seeds)
 
 
+@pytest.mark.long
 def test_update_in_chunks_is_that_of_the_batch(monkeypatch):
     """Six episodes of twelve steps, in three chunks of two episodes."""
     env = replace(ONE_AGENT, fixed_length=True)
@@ -91,6 +92,7 @@ def test_count_held_out_and_config_of_first_fit():
         assert config_of_first_fit(config).credit.steps == first
 
 
+@pytest.mark.long
 def test_fit_until_converged_keeps_the_best_decoders():
     """The only factor is the true reward, so a decoder's error is the distance of its weight from 1."""
     config = small_config("lare-linear", "ippo", ONE_TEAM, n_factors=(1,), n_envs=10)

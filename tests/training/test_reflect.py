@@ -67,6 +67,7 @@ def test_assessment_describes_factors(episodes):
     assert [line.split(":")[0] for line in ranges] == ["- f_0 (before)", "- f_0 (after)"]
 
 
+@pytest.mark.long
 def test_groups_have_intercepts(episodes):
     shift = [np.full(20, float(number % 2)) for number in range(N_EPISODES)]
     grouped = [

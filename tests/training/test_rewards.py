@@ -76,6 +76,7 @@ def test_exact_rewards_add_up_to_payments(method, algorithm, env, exact, payment
         np.testing.assert_array_equal(r_hat[~last], inexact[~last])
 
 
+@pytest.mark.long
 def test_rewards_of_episodes_that_are_not_learned_yet_are_not_corrected():
     config = exact_config("rd-linear", "td3", ONE_AGENT, "last", PaymentRule(period=4))  # compiled as above
     learner = add_steps(untrained_learner(config), config, random_steps())

@@ -109,6 +109,7 @@ def test_advance_equals_host_iterations(algorithm, method, begin, monkeypatch):
     assert_equal_sessions(compiled, host)
 
 
+@pytest.mark.long
 def test_advance_stops_at_a_factor_that_is_not_finite(begin):
     training = begin("ippo", "lare-rd")
     training.advance(20)

@@ -333,13 +333,18 @@ class CreditAssigner:
         Raises:
             LareError: the directory does not exist, is damaged, or was written by another version.
         """
-        credit = cls.__new__(cls)
         with report_damage(f"{directory} holds no credit assigner, or one that is damaged or of another version"):
-            credit.__setstate__(saving.read_state(Path(directory)))
+            return cls.from_state(saving.read_state(Path(directory)))
+
+    @classmethod
+    def from_state(cls, state: AssignerState) -> "CreditAssigner":
+        """Make an assigner of the state that `get_state` returned."""
+        credit = cls.__new__(cls)
+        credit.__setstate__(state)
         return credit
 
     def get_state(self, *, episodes: bool) -> AssignerState:
-        """Return the state, as plain data. `__setstate__` restores it. Steps and episodes are in it if `episodes` is true."""
+        """Return the state, as plain data. `from_state` restores it. Steps and episodes are in it if `episodes` is true."""
         with self.lock:
             return saving.get_state(self.learner, self.group_names, episodes=episodes)
 

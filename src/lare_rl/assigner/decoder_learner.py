@@ -241,7 +241,8 @@ class DecoderLearner:
         """Make gradient updates. Their batches are seeded by the number of updates so far."""
         spec, seed = self.config.spec, self.config.seed
         rng = np.random.default_rng([seed, self.n_updates])
-        longest = padded_size(max(len(episode.step_ids) for episode in self.store.episodes.values()))
+        # Diaster, RUDDER and RBT measure in units of the longest episode, so this should not shrink when episodes are overwritten.
+        longest = padded_size(max(self.store.max_ended_steps, self.config.max_steps or 1))
         with on_cpu():
             samples = [sample_batch(self.store, spec, rng, longest) for _ in range(n_updates)]
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *samples)

@@ -58,7 +58,8 @@ def get_state(learner: DecoderLearner, group_names: Iterable[GroupName], *, epis
     store = learner.store
     leaves = named_leaves((learner.decoder,))
     arrays = {LEARNED + name: np.asarray(leaf) for name, leaf in leaves.items()}
-    arrays["counts"] = np.array([store.n_ended, store.n_ended_steps, store.dropped + len(store.running)])
+    counts = store.n_ended, store.n_ended_steps, store.dropped + len(store.running), store.max_ended_steps
+    arrays["counts"] = np.array(counts)
     for name, chunks in zip(PHI_SAMPLE, zip(*learner.phi_sample, strict=True), strict=False):
         arrays[name] = np.concatenate(chunks)
     if episodes:
@@ -76,7 +77,8 @@ def restore(learner: DecoderLearner, state: AssignerState) -> None:
     with on_cpu():
         (learner.decoder,) = fill_template((learner.decoder,), learned)
     store = learner.store
-    store.n_ended, store.n_ended_steps, store.dropped = map(int, arrays["counts"])
+    counts = map(int, np.append(arrays["counts"], 1)[:4])  # an earlier version has three
+    store.n_ended, store.n_ended_steps, store.dropped, store.max_ended_steps = counts
     if "n_added" in arrays:
         _restore_store(store, arrays)
 

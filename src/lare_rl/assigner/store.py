@@ -98,6 +98,8 @@ class Store:
         """The number of payments that were ever stored: of episodes that have ended, if each is paid once."""
         self.n_ended_steps = 0
         """The number of steps that these payments are for, in total."""
+        self.max_ended_steps = 1
+        """The largest number of steps that any of these payments is for."""
         self.oldest: list[tuple[int, int]] = []
         """A heap of the stored episodes: first step, and number."""
         self.running: dict[Hashable, RunningEpisode] = {}
@@ -259,6 +261,7 @@ class Store:
     def put_episode(self, number: int, episode: StoredEpisode) -> None:
         """Store an episode under its number."""
         self.episodes[number] = episode
+        self.max_ended_steps = max(self.max_ended_steps, len(episode.step_ids))
         heapq.heappush(self.oldest, (int(episode.step_ids[0]), number))
 
     def get_running(self, env_id: Hashable, observation: Float[np.ndarray, "*agents observation"]) -> RunningEpisode:

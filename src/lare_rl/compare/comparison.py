@@ -1,7 +1,8 @@
-"""The statistics of a comparison, which stay honest for few runs.
+"""The statistics of a comparison.
 
-Intervals have 95%, by stratified bootstrap over the seeds (`bootstrap.py`). A method that was trained on several draws of the
-language model has a second interval, over the draws. The score of a draw is the mean over its seeds.
+The score of a seed is the mean over its draws of the language model. Intervals are of nominal 95%, by stratified bootstrap over the
+seeds (`bootstrap.py`): for few seeds they are too narrow, as docs/reference/comparisons.md shows. A method that was trained on several
+draws has a second interval, over the draws. The score of a draw is the mean over its seeds.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,10 +34,10 @@ class OverallRow:
 
     label: str
     n_seeds: int
-    improvement: Estimate | None
-    """Probability that a run scores more than a run of the baseline; None for the baseline and for single seeds."""
+    probability_of_improvement: Estimate | None
+    """Probability that a seed scores more than one of the baseline; None for the baseline and for single seeds."""
     p_value: float | None
-    """The two-sided p-value of the exact Mann-Whitney test against the baseline; None like `improvement`."""
+    """The two-sided p-value of the Mann-Whitney test against the baseline; None like `probability_of_improvement`."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class Row(OverallRow):
     draw_mean: Estimate | None
     """The mean, its interval over the draws; None for a single draw."""
     difference: Estimate | None
-    """The interquartile mean minus that of the baseline; None like `improvement`."""
+    """The interquartile mean minus that of the baseline; None like `probability_of_improvement`."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Comparison:
     curves: Mapping[str, Band]
     """The interquartile mean at each step, by label."""
     profiles: Mapping[str, Band]
-    """The share of runs that score more than x, by label."""
+    """The share of seeds that score more than x, by label."""
     groups: Mapping[str, LabelScores]
     """The scores, by label."""
     choice: ScoreChoice
@@ -90,17 +91,17 @@ def compare(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_RETURN)
     Raises `LareError` if some results are missing.
     """
     groups = group_results(results, choice)
-    final = {group.label: group.seed_scores for group in groups}
-    baseline = final[groups[0].label]
+    seed_scores = {group.label: group.seed_scores for group in groups}
+    baseline = seed_scores[groups[0].label]
     steps = np.array(groups[0].steps, float)
-    thresholds = np.linspace(min(map(np.min, final.values())), max(map(np.max, final.values())), 101)
+    thresholds = np.linspace(min(map(np.min, seed_scores.values())), max(map(np.max, seed_scores.values())), 101)
     curves = {group.label: np.moveaxis(group.scores.mean(axis=0), -1, 0) for group in groups}
     return Comparison(
         rows=tuple(_make_row(group, None if group is groups[0] else baseline) for group in groups),
         curves={label: Band(steps, *bootstrap(interquartile_mean, scores)) for label, scores in curves.items()},
         profiles={
             label: Band(thresholds, *bootstrap(lambda sample: performance_profile(sample, thresholds), scores))
-            for label, scores in final.items()
+            for label, scores in seed_scores.items()
         },
         groups={group.label: group for group in groups},
         choice=choice,
@@ -119,23 +120,23 @@ def compare_over_tasks(comparisons: Sequence[Comparison]) -> list[OverallRow]:
     """Compare methods with the baseline over the tasks of several comparisons.
 
     Runs are compared with runs on the same task by their order alone, so the tasks need no common scale. Each task has the same
-    weight. A row needs a method that ran on every task with equally many seeds. There are no rows without such a method besides the
-    baseline, or if the comparisons have different baselines.
+    weight. A method has a row if it ran on every task with the same number of seeds. There are no rows for a single comparison, if the
+    baselines differ, or if fewer than the baseline and one other method qualify.
     """
     if len(comparisons) < 2:
         return []
-    final: dict[str, Scores] = {}
+    seed_scores: dict[str, Scores] = {}
     for label in comparisons[0].groups:
         groups = [comparison.groups[label] for comparison in comparisons if label in comparison.groups]
         if len(groups) == len(comparisons) and len({len(group.seeds) for group in groups}) == 1:
-            final[label] = np.concatenate([group.seed_scores for group in groups], axis=1)
+            seed_scores[label] = np.concatenate([group.seed_scores for group in groups], axis=1)
     baselines = {comparison.rows[0].label for comparison in comparisons}
-    if len(baselines) > 1 or not final.keys() > baselines:
+    if len(baselines) > 1 or not seed_scores.keys() > baselines:
         return []
     (baseline,) = baselines
     return [
-        OverallRow(label, len(scores), *_improvement(scores, None if label == baseline else final[baseline]))
-        for label, scores in final.items()
+        OverallRow(label, len(scores), *_improvement(scores, None if label == baseline else seed_scores[baseline]))
+        for label, scores in seed_scores.items()
     ]
 
 
@@ -157,13 +158,13 @@ def _make_row(group: LabelScores, baseline: Scores | None) -> Row:
         std=sample_std(seed_means) if len(seed_means) > 1 else None,
         draw_mean=draw_mean,
         difference=difference,
-        improvement=improvement,
+        probability_of_improvement=improvement,
         p_value=p_value,
     )
 
 
 def _improvement(scores: Scores, baseline: OtherScores | None) -> tuple[Estimate | None, float | None]:
-    """Return `Row.improvement` and `Row.p_value`."""
+    """Return `Row.probability_of_improvement` and `Row.p_value`."""
     if baseline is None or min(len(scores), len(baseline)) < 2:
         return None, None
     improvement = estimate(probability_of_improvement, scores, baseline)

@@ -38,7 +38,7 @@ def write_comparisons(
     """
     comparisons = compare_tasks(results, choice)
     overall = [
-        (*_first_cells(row, number), *map(_format_cell, (row.improvement, row.p_value)))
+        (*_first_cells(row, number), *map(_format_cell, (row.probability_of_improvement, row.p_value)))
         for number, row in enumerate(compare_over_tasks(comparisons))
     ]
     tasks = ", ".join(task for comparison in comparisons for task in comparison.tasks)
@@ -64,7 +64,7 @@ def comparison_table(comparison: Comparison) -> tuple[tuple[str, ...], list[tupl
             *_first_cells(row, number),
             str(row.iqm),
             format_plus_minus(row.mean, row.std),
-            *map(_format_cell, (row.difference, row.improvement, row.p_value)),
+            *map(_format_cell, (row.difference, row.probability_of_improvement, row.p_value)),
             *((str(row.n_draws), _format_cell(row.draw_mean)) if several_draws else ()),
         )
         for number, row in enumerate(comparison.rows)

@@ -110,7 +110,7 @@ def _mean_loss(
         assert output.log_std is not None
         precision = episode_means(agent_mean(jnp.exp(-2 * output.log_std)))
         log_std = episode_means(agent_mean(output.log_std))
-        loss = losses.leave_one_out_likelihood(mean, target, weight, precision, log_std)
+        loss = losses.leave_one_out_nll(mean, target, weight, precision, log_std)
     elif fit is Fit.SAMPLED_STEPS_UNBIASED:
         variance = losses.subsampling_variance(r_hat.reshape(n_episodes, -1), episodes.length)
         loss = losses.unbiased_squared_error(mean, target, weight, variance)
@@ -118,7 +118,7 @@ def _mean_loss(
         loss = losses.squared_error(mean, target, weight)
     if output.penalty is None:
         return loss
-    mean_weight = losses.batch_mean(weight, weight)  # 1 or, with `sum_form`, the mean of T^2
+    mean_weight = losses.mean_over_episodes(weight, weight)  # 1 or, with `sum_form`, the mean of T^2
     return loss + mean_weight * masked_mean(agent_mean(output.penalty), decoder_state.step_rows(episodes))
 
 

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput
-from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, batch_mean, step_loss
+from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, step_loss
 from lare_rl.credit.spec import CreditSpec
+from lare_rl.nn.masks import masked_mean
 from lare_rl.nn.networks import GRU, MLP, Linear
 
 __all__ = ["Diaster"]
@@ -78,4 +79,4 @@ class Diaster(eqx.Module):
         f_prefix = self.piece_rewards(inputs, jnp.zeros_like(inputs[..., 0], bool))
         f_prefix = jnp.where(t == last, total[:, None], f_prefix)
         loss = piece_loss + step_loss(self.step_model, inputs, f_prefix, length)
-        return batch_mean(mask * loss, mask)
+        return masked_mean(loss, mask)

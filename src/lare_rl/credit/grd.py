@@ -27,8 +27,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput
-from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, batch_mean, is_step
+from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, is_step
 from lare_rl.credit.spec import CreditSpec
+from lare_rl.nn.masks import masked_mean
 from lare_rl.nn.networks import MLP, bound_log_std
 
 __all__ = ["GRD", "causes", "sample_mask"]
@@ -128,7 +129,7 @@ class GRD(eqx.Module):
         valid = is_step(length, inputs.shape[1]) & (mask > 0)[:, None]
         r_hat = self._reward(inputs, sample_mask(self.state_reward, keys[0]), sample_mask(self.action_reward, keys[1]))
         error = jnp.sum(valid * r_hat, axis=1) / jnp.maximum(length, 1) - target
-        reward_loss = batch_mean(mask * error**2, mask)
+        reward_loss = masked_mean(error**2, mask)
         reward_sparsity = lambda_sr * _mean_sparsity(self.state_reward) + lambda_ar * _mean_sparsity(self.action_reward)
 
         n_valid, rows = jnp.sum(valid), inputs.reshape(-1, inputs.shape[-1])

@@ -3,8 +3,8 @@
 Each loss maps a decoder's outputs for some episodes to one number, which is minimised. Notation: r_hat is the proxy reward of
 a step, T the length of an episode, R its return, K the number of its sampled steps, B the number of episodes in a batch.
 
-The target is R/T, as in LaRe's published code, or R with `sum_form` (Eq. 6 of the LaRe paper). R/T is far better conditioned, and has
-the same minimiser if all episodes have the same length.
+The target is R/T, as in LaRe's published code. With `sum_form`, each squared error has the weight T^2, so it is (sum_t r_hat_t - R)^2
+(Eq. 6 of the LaRe paper): longer episodes weigh more. If all episodes have the same length, the two losses differ by a factor alone.
 """
 
 import jax
@@ -17,11 +17,11 @@ __all__ = [
     "EpisodeInputs",
     "EpisodeLengths",
     "PerEpisode",
-    "batch_mean",
     "episode_means",
     "episode_weight",
     "is_step",
-    "leave_one_out_likelihood",
+    "leave_one_out_nll",
+    "mean_over_episodes",
     "squared_error",
     "step_loss",
     "subsampling_variance",
@@ -33,9 +33,9 @@ EpisodeInputs = Float[Array, "episodes steps inputs"]
 EpisodeLengths = Int[Array, " episodes"]
 
 
-def batch_mean(values: PerEpisode, weight: PerEpisode) -> Float[Array, ""]:
-    """Return the sum of values, divided by the number of episodes whose weight is not zero."""
-    return jnp.sum(values) / jnp.maximum(jnp.sum(weight > 0), 1)
+def mean_over_episodes(weighted: PerEpisode, weight: PerEpisode) -> Float[Array, ""]:
+    """Return the sum of weighted values, divided by the number of episodes whose weight is above 0."""
+    return jnp.sum(weighted) / jnp.maximum(jnp.sum(weight > 0), 1)
 
 
 def episode_means(
@@ -43,7 +43,8 @@ def episode_means(
 ) -> PerEpisode:
     """Return mean_t r_hat_t of each episode over its steps in the batch: all T of them, or K sampled ones.
 
-    `n_steps` is the number of steps of each episode in the batch. Steps whose `episode_index` is not in 0..B-1 are ignored.
+    `n_steps` is the number of steps of each episode in the batch. Rows whose `episode_index` is B or more are padding, and are ignored.
+    No index is negative.
     """
     total = jnp.zeros(n_steps.shape, r_hat.dtype).at[episode_index].add(r_hat, mode="drop")
     return total / jnp.maximum(n_steps, 1)
@@ -52,17 +53,19 @@ def episode_means(
 def squared_error(mean: PerEpisode, target: PerEpisode, weight: PerEpisode) -> Float[Array, ""]:
     """Return sum_b w_b (mean_b - target_b)^2 / B, over the B episodes whose weight is not zero.
 
-    With `mean` over all T steps and `target` = R/T, this is the loss of RD (Efroni et al., 2021; LaRe, Eq. 6). With `mean` over K
-    sampled steps, it is the loss of RRD (Ren et al., 2022, Eq. 6). `episode_weight` computes `weight`.
+    With `mean` over all T steps and `target` = R/T, this is the loss of RD (Efroni et al., 2021): with weight 1 as in LaRe's code,
+    with weight T^2 as in LaRe's Eq. 6. With `mean` over K sampled steps, it is the loss of RRD (Ren et al., 2022, Eq. 6).
+    `episode_weight` computes `weight`.
     """
-    return batch_mean(weight * (mean - target) ** 2, weight)
+    return mean_over_episodes(weight * (mean - target) ** 2, weight)
 
 
 def subsampling_variance(r_hat: Float[Array, "episodes K"], length: Int[Array, " episodes"]) -> PerEpisode:
     """Return Var_K(r_hat) (1 - K/T) / K, which sampling K of T steps adds to the squared error (Ren et al., 2022, Appendix).
 
     Var_K is the sample variance (divided by K - 1). The finite-population factor (1 - K/T) is due to sampling without replacement.
-    If K >= T, all T steps are used and the value is 0. It is never negative.
+    If K >= T, all T steps are used and the value is 0. It is never negative. K = 1 has no sample variance: the value is 0, and the loss
+    is that of RRD.
     """
     k = r_hat.shape[1]
     fraction = jnp.maximum(1 - k / jnp.maximum(length, 1), 0)
@@ -73,10 +76,10 @@ def unbiased_squared_error(
     mean: PerEpisode, target: PerEpisode, weight: PerEpisode, variance: PerEpisode
 ) -> Float[Array, ""]:
     """Return the loss of RRD-unbiased: RRD's loss minus the `subsampling_variance`. Its expectation is RD's loss."""
-    return squared_error(mean, target, weight) - batch_mean(weight * variance, weight)
+    return squared_error(mean, target, weight) - mean_over_episodes(weight * variance, weight)
 
 
-def leave_one_out_likelihood(
+def leave_one_out_nll(
     mean: PerEpisode, target: PerEpisode, weight: PerEpisode, precision: PerEpisode, log_std: PerEpisode
 ) -> Float[Array, ""]:
     """Return the negative log likelihood of LRR without its constant: the mean of w_b (mean_b - target_b)^2 p_b / 2 + l_b.
@@ -84,7 +87,7 @@ def leave_one_out_likelihood(
     p_b = mean_t 1/sigma_t^2 and l_b = mean_t log sigma_t, over the steps of episode b. See `lrr.py`.
     """
     loss = weight * (mean - target) ** 2 * precision / 2 + jnp.where(weight > 0, log_std, 0)
-    return batch_mean(loss, weight)
+    return mean_over_episodes(loss, weight)
 
 
 def episode_weight(length: Int[Array, " episodes"], mask: PerEpisode, sum_form: bool) -> PerEpisode:
@@ -98,7 +101,7 @@ def is_step(length: EpisodeLengths, max_steps: int) -> Bool[Array, "episodes ste
 
 
 def step_loss(
-    step_model: MLP, inputs: EpisodeInputs, prefix: Float[Array, "episodes steps"], length: EpisodeLengths
+    step_model: MLP, inputs: EpisodeInputs, prefix_returns: Float[Array, "episodes steps"], length: EpisodeLengths
 ) -> Float[Array, " episodes"]:
     """Return the mean squared error of a step model over the steps of each episode, for Diaster, RUDDER and RBT.
 
@@ -107,11 +110,11 @@ def step_loss(
 
         (r_hat(x_t) - L (F_t - F_{t-1}))^2,    F_{-1} = 0
 
-    `prefix` is F_t, the sum of the rewards of the steps 0 to t by the model of episodes; no gradient goes to it. It is in units of L
-    times the scale, where L is the number of steps of the longest episode and the scale is the root mean square of R/T. The step
-    model is in units of the scale.
+    `prefix_returns` is F_t, the sum of the rewards of the steps 0 to t by the model of episodes, divided by L times the scale; no
+    gradient goes to it. L is the number of rows of an episode with its padding: the steps of the longest episode or, in the assigner,
+    a little more. The scale is the root mean square of R/T. The step model predicts the reward divided by the scale.
     """
     max_steps = inputs.shape[1]
-    target = max_steps * jnp.diff(jax.lax.stop_gradient(prefix), axis=1, prepend=0)
+    target = max_steps * jnp.diff(jax.lax.stop_gradient(prefix_returns), axis=1, prepend=0)
     squared_error = (step_model(inputs)[..., 0] - target) ** 2
     return jnp.sum(is_step(length, max_steps) * squared_error, axis=1) / jnp.maximum(length, 1)

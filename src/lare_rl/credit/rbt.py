@@ -22,9 +22,10 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput, split_key
 from lare_rl.credit.decoders import RBT_STEPS
-from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, batch_mean, is_step, step_loss
+from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, is_step, step_loss
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
+from lare_rl.nn.masks import masked_mean
 from lare_rl.nn.networks import MLP, Linear
 
 __all__ = ["RBT", "Block"]
@@ -145,4 +146,4 @@ class RBT(eqx.Module):
         state_loss = jnp.sum(valid * squared_error, axis=1) / n_steps
         prefix = jnp.cumsum(reward, axis=1) / max_steps
         loss = reward_loss + state_loss + step_loss(self.step_model, self._step_inputs(inputs), prefix, length)
-        return batch_mean(mask * loss, mask)
+        return masked_mean(loss, mask)

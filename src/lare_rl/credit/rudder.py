@@ -23,8 +23,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput
-from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, batch_mean, is_step, step_loss
+from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, is_step, step_loss
 from lare_rl.credit.spec import CreditSpec
+from lare_rl.nn.masks import masked_mean
 from lare_rl.nn.networks import MLP, Linear
 
 __all__ = ["RUDDER"]
@@ -91,4 +92,4 @@ class RUDDER(eqx.Module):
         share = jnp.arange(1, max_steps + 1) / n_steps[:, None]
         prefix = g + share * (total - last)[:, None]
         loss = return_loss + step_loss(self.step_model, inputs, prefix, length)
-        return batch_mean(mask * loss, mask)
+        return masked_mean(loss, mask)

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from lare_rl.envs.interface import EnvSpec, Timestep
 from lare_rl.errors import LareError, install_command, short_repr
 from lare_rl.tasks.spec import MAX_LEVELS, TaskSpec
+from lare_rl.util.sanitize import abbreviate
 
 __all__ = [
     "EnvOutputError",
@@ -20,7 +21,6 @@ __all__ = [
     "convert_output",
     "import_hint",
     "name_step",
-    "no_time_limit_error",
     "one_line_errors",
     "read_measures",
     "to_float",
@@ -46,8 +46,7 @@ def as_lare_error(message: str, error: BaseException, hint: str = "") -> LareErr
         return error
     logging.getLogger(__name__).debug("%s", message, exc_info=error)
     text = " ".join(str(error).split()) or type(error).__name__
-    text = text if len(text) <= MAX_ERROR else f"{text[:MAX_ERROR]}..."
-    return LareError(f"{message}: {text}{hint}")
+    return LareError(f"{message}: {abbreviate(text, MAX_ERROR)}{hint}")
 
 
 @contextlib.contextmanager
@@ -102,11 +101,14 @@ def check_finite(timestep: Timestep, spec: EnvSpec, owner: str) -> None:
             raise EnvOutputError(f"{owner}: the {name}{agent} contains {values[index]}{entry}")
 
 
-def no_time_limit_error(task: TaskSpec) -> LareError:
-    return LareError(
-        f"task {task.name!r}: {task.environment} has no time limit, so an episode may never end. "
-        "Set max_episode_steps in the task file, to the length of its longest episode or more."
-    )
+class NoTimeLimitError(LareError):
+    """An episode of the environment may never end."""
+
+    def __init__(self, task: TaskSpec):
+        super().__init__(
+            f"task {task.name!r}: {task.environment} has no time limit, so an episode may never end. "
+            "Set max_episode_steps in the task file, to the length of its longest episode or more."
+        )
 
 
 def convert_output(convert: Callable[[Any], T], value: Any, subject: str) -> T:

@@ -12,10 +12,10 @@ from jaxtyping import Float
 from lare_rl.envs import mujoco_rewards
 from lare_rl.envs.agent_arrays import Agent, integer_dtype
 from lare_rl.envs.env_errors import (
+    NoTimeLimitError,
     close_env,
     convert_output,
     import_hint,
-    no_time_limit_error,
     one_line_errors,
     read_measures,
     to_float,
@@ -83,7 +83,7 @@ class GymnasiumEnv:
         self.environment = make_gymnasium(task.environment, task.max_episode_steps, **kwargs)
         if not (self.environment.spec and self.environment.spec.max_episode_steps):
             self.close()
-            raise no_time_limit_error(task)
+            raise NoTimeLimitError(task)
         action_space = self.environment.action_space
         assert isinstance(action_space, Discrete | Box)
         self._agent = Agent("agent", self.environment.observation_space, action_space, observes_mask=False)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.envs import jax_packages
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
-from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
+from lare_rl.envs.env_errors import NoTimeLimitError, one_line_errors
 from lare_rl.envs.interface import Timestep, with_available_action
 from lare_rl.envs.pettingzoo_construct import group_by_team
 from lare_rl.errors import LareError, short_repr
@@ -51,7 +51,7 @@ def make(task: TaskSpec, **_: Any) -> "JaxMARLEnv":
         env = jax_packages.construct(task, names, jaxmarl.make, changes | task.arguments)
     limit = task.max_episode_steps or (getattr(env, limit_name) if limit_name else None)
     if limit is None:
-        raise no_time_limit_error(task)
+        raise NoTimeLimitError(task)
     return JaxMARLEnv(env, task, int(limit))
 
 

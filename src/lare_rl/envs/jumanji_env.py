@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from lare_rl.envs.env_errors import no_time_limit_error
+from lare_rl.envs.env_errors import NoTimeLimitError
 from lare_rl.envs.jax_packages import AgentEnv, action_fields, construct, import_package, mask_combinations, unusable
 from lare_rl.tasks.spec import TaskSpec
 
@@ -44,7 +44,7 @@ def make(task: TaskSpec, **_: Any) -> AgentEnv:
         env = construct(task, names, jumanji.make, {TIME_LIMIT: task.max_episode_steps} | task.arguments)
     max_steps = task.max_episode_steps or getattr(env, TIME_LIMIT, None)
     if max_steps is None:
-        raise no_time_limit_error(task)
+        raise NoTimeLimitError(task)
     action_spec = action_fields(env.action_spec, task.environment)
 
     def read(timestep: Any, steps: Any) -> dict[str, Any]:

@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
 from lare_rl.envs.env_errors import (
     EnvOutputError,
+    NoTimeLimitError,
     close_env,
     convert_output,
-    no_time_limit_error,
     one_line_errors,
     read_measures,
     to_float,
@@ -67,7 +67,7 @@ class ParallelHost:
             raise LareError(f"{self._label}: {error}") from None
         max_steps = task.max_episode_steps or find_time_limit(environment, task.arguments)
         if max_steps is None:
-            raise no_time_limit_error(task)
+            raise NoTimeLimitError(task)
         self._available = self.layout.available
         self._masks_actions = any(agent.observes_mask for agent in agents) or not self._available.all()
         self._credit_from_state = any(role.credit_scope == "state" for role in (task, *task.teams))

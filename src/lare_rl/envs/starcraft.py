@@ -23,9 +23,9 @@ from lare_rl.util.variables import read_variable
 __all__ = ["StarCraft", "make"]
 
 PACKAGES = {"smacv2.env": "smacv2.env", "smac.env.starcraft2": "smac.env"}
-"""The module with the game by a module that only the right package has: PyPI's `smac` has none of these."""
+"""The module of StarCraft2Env, by a module to look for. PyPI's `smac`, another project, has none of the modules to look for."""
 DIFFICULTY = "7"
-"""The difficulty "very hard" of the game's built-in opponent, for which results are usually reported."""
+"""The difficulty "very hard" of StarCraft II's built-in opponent, for which results are usually reported."""
 MAX_CRASHES = 3
 """A run fails after this number of crashes without a complete episode between them."""
 NO_OP = 0
@@ -40,16 +40,16 @@ def make(task: TaskSpec, **_: Any) -> "StarCraft":
 class StarCraft:
     """A map of SMAC as a `HostEnv`. The actions are SMAC's: no-op, stop, north, south, east, west, and one attack for each enemy."""
 
-    def __init__(self, name: str, make_game: Callable[..., Any] | None = None):
-        """Make the game of a map, by default with SMAC's class.
+    def __init__(self, name: str, make_env: Callable[..., Any] | None = None):
+        """Make SMAC's environment of a map. `make_env` is StarCraft2Env by default.
 
         Raises `LareError` if the package, StarCraft II or the map is missing.
         """
-        self._name, self._make_game = name, make_game or _find_game()
-        self._game: Any = None
-        self._can_continue = False
+        self._name, self._make_env = name, make_env or _find_env_class()
+        self._env: Any = None
+        self._can_reset = False
         self._n_crashes = 0
-        info = self._launch(0).get_env_info()
+        info = self._new_env(0).get_env_info()
         self.spec = EnvSpec(
             teams=(Team("ally", 0, info["n_agents"]),),
             observation_size=info["obs_shape"],
@@ -62,54 +62,54 @@ class StarCraft:
             measures=("won",),
         )
 
-    def _launch(self, seed: int) -> Any:
-        """Make a game with this seed. StarCraft II itself starts with the first episode."""
+    def _new_env(self, seed: int) -> Any:
+        """Make SMAC's environment with this seed. Its first reset starts StarCraft II."""
         self.close()
         with one_line_errors(f"SMAC cannot make {self._name!r}"):
-            self._game = self._make_game(map_name=self._name, difficulty=DIFFICULTY, seed=seed)
-        return self._game
+            self._env = self._make_env(map_name=self._name, difficulty=DIFFICULTY, seed=seed)
+        return self._env
 
     def reset(self, seed: int) -> Timestep:
-        """Start an episode. Only the first of a game follows its seed: SMAC takes a seed only for a new game, which starts slowly."""
-        # Before an episode has ended, SMAC's reset would start another game in addition to the running one.
-        if not self._can_continue:
-            self._launch(seed)
+        """Start an episode. The seed acts only if StarCraft II starts anew: at first, and after an episode that did not end."""
+        # Before an episode has ended, SMAC's reset would start StarCraft II again, in addition to the running process.
+        if not self._can_reset:
+            self._new_env(seed)
         with one_line_errors(f"StarCraft II does not start {self._name!r}"):
-            self._game.reset()
+            self._env.reset()
         self._steps = 0
         return self._make_timestep(np.zeros(self.spec.n_agents, np.float32), done=False, won=False)
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
-        """Make one step. If the game crashes, the episode is truncated, and the next `reset` starts a new game.
+        """Make one step. If StarCraft II crashes, the episode is truncated, and the next `reset` starts it again.
 
-        Raises `LareError` if SMAC refuses an action, or if the game has crashed too often.
+        Raises `LareError` if SMAC refuses an action, or if StarCraft II has crashed too often.
         """
         with one_line_errors(f"StarCraft II failed in a step of {self._name!r}"):
-            reward, done, info = self._game.step(np.argmax(action, axis=1).tolist())
+            reward, done, info = self._env.step(np.argmax(action, axis=1).tolist())
         if done and not info:  # SMAC reports a crash only in this way
             return self._handle_crash()
         self._steps += 1
         if done:
-            self._can_continue, self._n_crashes = True, 0
+            self._can_reset, self._n_crashes = True, 0
         rewards = np.where(self._timestep.alive, np.float32(reward), np.float32(0))
         return self._make_timestep(rewards, done=bool(done), won=bool(info.get("battle_won", False)))
 
     def _handle_crash(self) -> Timestep:
         """Return the previous timestep, truncated and with reward 0. Raises `LareError` after `MAX_CRASHES` crashes."""
         message = f"StarCraft II crashed in step {self._steps + 1} of an episode of {self._name}"
-        self._can_continue, self._n_crashes = False, self._n_crashes + 1
+        self._can_reset, self._n_crashes = False, self._n_crashes + 1
         if self._n_crashes == MAX_CRASHES:
             raise LareError(f"{message}, {MAX_CRASHES} times in a row")
-        warnings.warn(f"{message}: the episode ends there, and the game starts again", RuntimeWarning, stacklevel=3)
+        warnings.warn(f"{message}: the episode ends there, and StarCraft II starts again", RuntimeWarning, stacklevel=3)
         return self._timestep._replace(reward=np.zeros_like(self._timestep.reward), truncated=np.array(True))
 
     def _make_timestep(self, reward: Float[np.ndarray, " agents"], done: bool, won: bool) -> Timestep:
-        available = np.array(self._game.get_avail_actions(), bool)
+        available = np.array(self._env.get_avail_actions(), bool)
         alive = ~available[:, NO_OP]
         at_limit = self._steps >= self.spec.max_steps
         self._timestep = Timestep(
-            observation=np.stack(self._game.get_obs()).astype(np.float32),
-            state=np.asarray(self._game.get_state(), np.float32),
+            observation=np.stack(self._env.get_obs()).astype(np.float32),
+            state=np.asarray(self._env.get_state(), np.float32),
             available=available,
             alive=alive,
             reward=reward,
@@ -122,17 +122,17 @@ class StarCraft:
 
     def render(self) -> Any:
         with one_line_errors(f"StarCraft II cannot draw {self._name!r}"):
-            return self._game.render(mode="rgb_array")
+            return self._env.render(mode="rgb_array")
 
     def close(self) -> None:
-        if self._game is not None:
-            close_env(self._game, f"StarCraft II on {self._name!r}")
-            self._game = None
-        self._can_continue = False
+        if self._env is not None:
+            close_env(self._env, f"StarCraft II on {self._name!r}")
+            self._env = None
+        self._can_reset = False
 
 
-def _find_game() -> Callable[..., Any]:
-    modules = [game_module for marker, game_module in PACKAGES.items() if _is_installed(marker)]
+def _find_env_class() -> Callable[..., Any]:
+    modules = [module for marker, module in PACKAGES.items() if _is_installed(marker)]
     if not modules:
         raise LareError(
             "SMAC is not installed: pip install git+https://github.com/oxwhirl/smacv2.git"

@@ -33,19 +33,21 @@ __all__ = ["check_video_path", "encode_film", "record_frames", "record_video", "
 MANY_AGENTS_FPS = 8
 """Frames per second, if a film shows many agents."""
 MAX_GIF_FPS = 25.0
-"""The most frames per second of a GIF, because drawing a frame may take long without a graphics card."""
+"""The most frames per second of a GIF and of a film in JAX: drawing a frame may take long without a graphics card."""
 DEFAULT_FPS = 30
 """Frames per second of an environment that does not say how many it draws."""
 MAX_DRAWINGS = 200
 """The most frames of a film of a single agent in JAX, whose package may need a second for each."""
 FRAME_SIZE = {"width": 320, "height": 320}
-"""Pixels of a MuJoCo film. The default, 480 by 480, takes twice the time and space."""
-FILM_WIDTH, FILM_QUALITY = 240, 55
-"""Pixels and quality of a film in a page."""
+"""Pixels of the film of a MuJoCo model with a camera that follows it. The default, 480 by 480, takes twice the time and space."""
+FILM_SIZE, FILM_QUALITY = 240, 55
+"""The largest width and height of a film in a page, in pixels, and its quality."""
 
 
 def record_video(run: Run, path: str | Path, best: bool = False, deterministic: bool = False) -> None:
-    """Film one episode of the first seed's policy, the last or the best, as a .gif, or as an .mp4 with the extra `lare-rl[video]`.
+    """Film one episode of the first seed's policy: the last policy or, with `best`, the best one.
+
+    The film is a .gif or, with the extra `lare-rl[video]`, an .mp4.
 
     A film of a particle task shows each agent's credit, as number and colour.
 
@@ -69,9 +71,11 @@ def record_frames(
     """Return the frames that `record_video` shows, and the seconds for which it shows each.
 
     Args:
-        max_fps: the largest number of frames per second.
-        max_frames: the largest number of frames. A longer film ends early; that of a single agent in JAX leaves steps out.
-        played: episodes of a run with many agents; the film shows the first. By default, the policy plays new episodes.
+        max_fps: the largest number of frames per second of a simulation on the host. Other films have 25, or 8 of many agents.
+        max_frames: the largest number of frames. A longer film ends early; that of a single agent in JAX leaves steps out, and so
+            shows the episode faster.
+        played: episodes of a run with many agents; the film shows the first. By default, the policy plays new episodes. A run
+            with one agent does not use it.
 
     Raises:
         LareError: the environment cannot be drawn on this machine.
@@ -96,10 +100,10 @@ def record_frames(
 
 
 def encode_film(frames: Sequence[Frame], frame_seconds: float, max_bytes: int) -> bytes:
-    """Return a small film as an animated WebP, which ends early if it would be larger than `max_bytes`."""
+    """Return a small film as an animated WebP. It ends early if it would be larger than `max_bytes`, and has one frame or more."""
     images = _to_images(frames)
     for image in images:
-        image.thumbnail((FILM_WIDTH, FILM_WIDTH))
+        image.thumbnail((FILM_SIZE, FILM_SIZE))
     while True:
         film = _encode(images, "WEBP", frame_seconds, quality=FILM_QUALITY, method=4)
         if len(film) <= max_bytes or len(images) == 1:
@@ -127,7 +131,8 @@ def write_video(path: Path, frames: Sequence[Frame], frame_seconds: float) -> No
 
         imageio.imwrite(path, list(frames), fps=1 / frame_seconds)
     except (OSError, ValueError, ImportError, TypeError) as error:
-        raise LareError(f"the video {path} cannot be written: {error}; .mp4 needs lare-rl[video]") from error
+        hint = "; .mp4 needs lare-rl[video]" if isinstance(error, ImportError) else ""
+        raise LareError(f"the video {path} cannot be written: {error}{hint}") from error
 
 
 def _to_images(frames: Iterable[Frame]) -> list[Any]:
@@ -139,8 +144,11 @@ def _to_images(frames: Iterable[Frame]) -> list[Any]:
 
 
 def _encode(images: Sequence[Any], file_format: str, frame_seconds: float, **options: Any) -> bytes:
-    """Return an animation that repeats."""
-    buffer, duration_ms = BytesIO(), round(1000 * frame_seconds)
+    """Return an animation that repeats. A frame of a GIF lasts whole hundredths of a second."""
+    buffer, duration_ms = (
+        BytesIO(),
+        round(100 * frame_seconds) * 10 if file_format == "GIF" else round(1000 * frame_seconds),
+    )
     first, *rest = images
     first.save(buffer, file_format, save_all=True, append_images=rest, duration=duration_ms, loop=0, **options)
     return buffer.getvalue()
@@ -204,7 +212,7 @@ def _render(env: HostEnv, run: Run) -> Frame:
 
 
 def _has_tracking_camera(run: Run) -> bool:
-    """Return whether the environment is a MuJoCo model with a camera that follows it. Gymnasium does not use it by default."""
+    """Return whether the environment is a MuJoCo model with a camera that follows it, which Gymnasium must be asked for by name."""
     with closing(make_host_env(run.config.task.evaluation_task)) as env:
         if not isinstance(env, GymnasiumEnv):
             return False

@@ -44,8 +44,8 @@ _HER_ARGUMENTS = {"n_sampled_goal", "goal_selection_strategy", "copy_info_dict"}
 class CreditReplayBuffer(ReplayBuffer):
     """A replay buffer that samples steps with r_hat as their rewards, by the newest decoder.
 
-    It shows every step to the assigner, with actions in the environment's units and, under VecNormalize, with the observations and
-    rewards before they were normalised. r_hat is not divided by VecNormalize's scale, which is that of the environment's rewards.
+    The assigner gets each step as the environment made it: actions in its units, observations and rewards before VecNormalize. r_hat
+    is not normalised.
     """
 
     def __init__(
@@ -67,15 +67,19 @@ class CreditReplayBuffer(ReplayBuffer):
         name = type(self).__name__
         if credit is None:
             raise LareError(f"{name} needs an assigner: replay_buffer_kwargs={{'credit': credit}}")
+        check_assigner(credit)
         if isinstance(self, HerReplayBuffer) or not _HER_ARGUMENTS.isdisjoint(kwargs):
             raise LareError(f"{name} cannot relabel goals, whose rewards come from compute_reward: use HerReplayBuffer")
         if isinstance(observation_space, spaces.Dict) != isinstance(self, DictReplayBuffer):
-            other = "CreditReplayBuffer" if isinstance(self, DictReplayBuffer) else "CreditDictReplayBuffer"
-            raise LareError(f"{name} cannot store observations of {observation_space}: use {other}")
+            other = "use CreditReplayBuffer" if isinstance(self, DictReplayBuffer) else "use CreditDictReplayBuffer"
+            hint = "flatten them" if isinstance(self, NStepReplayBuffer) else other
+            raise LareError(f"{name} cannot store observations of {observation_space}: {hint}")
         super().__init__(buffer_size, observation_space, action_space, *args, **kwargs)
         check_capacity(credit, self.buffer_size * self.n_envs)
-        self.steps = np.full((self.buffer_size, self.n_envs), -1)  # the assigner's numbers; -1 if there is no step yet
-        self._connect(credit)
+        self.step_ids = np.full(
+            (self.buffer_size, self.n_envs), -1
+        )  # those of the assigner; -1 if there is no step yet
+        self._attach_assigner(credit)
 
     @property
     def credit(self) -> CreditAssigner:
@@ -97,8 +101,8 @@ class CreditReplayBuffer(ReplayBuffer):
             low, high = self.action_space.low, self.action_space.high
             env_action = low + (0.5 * (env_action + 1.0) * (high - low))  # as `BasePolicy.unscale_action`
         # `done` includes time limits, and the assigner learns from both kinds of ends in the same way.
-        cut = np.zeros_like(done)
-        self.steps[self.pos] = self._recorder.add(obs, env_action, next_obs, reward, done, cut, infos=infos)
+        truncated = np.zeros_like(done)
+        self.step_ids[self.pos] = self._recorder.add(obs, env_action, next_obs, reward, done, truncated, infos=infos)
         super().add(obs, next_obs, action, reward, done, infos)
 
     def sample(self, batch_size: int, env: Any = None) -> Any:
@@ -110,20 +114,19 @@ class CreditReplayBuffer(ReplayBuffer):
     def _normalize_reward(reward: np.ndarray, env: Any = None) -> np.ndarray:
         return reward
 
-    def _connect(self, credit: CreditAssigner) -> None:
+    def _attach_assigner(self, credit: CreditAssigner) -> None:
         env_ids = [object() for _ in range(self.n_envs)]
         self._recorder = StepRecorder(credit, self.observation_space, self.action_space, env_ids)
-        self.rewards = _ProxyRewards(credit, self.steps)  # pyright: ignore[reportAttributeAccessIssue]
+        self.rewards = _ProxyRewards(credit, self.step_ids)  # pyright: ignore[reportAttributeAccessIssue]
 
     def __getstate__(self) -> dict[str, Any]:
         state = {name: value for name, value in vars(self).items() if name not in ("_recorder", "rewards")}
         return state | {"credit": self.credit.get_state(episodes=True)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        credit = CreditAssigner.__new__(CreditAssigner)
-        credit.__setstate__(state.pop("credit"))
+        credit = CreditAssigner.from_state(state.pop("credit"))
         vars(self).update(state)
-        self._connect(credit)
+        self._attach_assigner(credit)
 
 
 class CreditDictReplayBuffer(CreditReplayBuffer, DictReplayBuffer):
@@ -140,11 +143,11 @@ class CreditNStepReplayBuffer(CreditReplayBuffer, NStepReplayBuffer):
 class _ProxyRewards:
     """Replaces a buffer's array of rewards. Reading rows computes r_hat by the newest decoder."""
 
-    def __init__(self, credit: CreditAssigner, steps: Int[np.ndarray, "rows environments"]):
-        self.credit, self.steps = credit, steps
+    def __init__(self, credit: CreditAssigner, step_ids: Int[np.ndarray, "rows environments"]):
+        self.credit, self.step_ids = credit, step_ids
 
     def __getitem__(self, index: Any) -> Float[np.ndarray, "*shape"]:
-        return self.credit.rewards_at(self.steps[index])
+        return self.credit.rewards_at(self.step_ids[index])
 
     def __setitem__(self, index: Any, value: Any) -> None:
         """Ignore the environment's rewards, which Stable-Baselines3 writes here."""
@@ -168,68 +171,74 @@ class CreditCallback(BaseCallback):
         super().__init__(verbose)
         check_assigner(credit)
         self.credit, self.updates = credit, updates
-        self.steps: list[Int[np.ndarray, " environments"]] = []  # the numbers of the steps of this rollout
+        self.step_ids: list[Int[np.ndarray, " environments"]] = []  # of the steps of this rollout
 
     def _on_training_start(self) -> None:
+        if self.parent is not None:
+            raise LareError(
+                "CreditCallback must see every step: give it to learn() directly, or in a list, not within another callback"
+            )
         buffer = getattr(self.model, "rollout_buffer", None)
         if buffer is None:
             name = type(self.model).__name__
             raise LareError(
-                f"CreditCallback needs rollouts, and {name} has a replay buffer: "
-                f"{name}(..., replay_buffer_class=CreditReplayBuffer, replay_buffer_kwargs={{'credit': credit}})"
+                f"CreditCallback needs an algorithm with a rollout buffer, such as PPO or A2C. {name} has none. For one with a replay "
+                "buffer: replay_buffer_class=CreditReplayBuffer, replay_buffer_kwargs={'credit': credit}"
             )
         check_capacity(self.credit, buffer.buffer_size * buffer.n_envs)
         # The keys belong to the model, so that a second call of `learn` continues the running episodes.
         env_ids = [(id(self.model), env_index) for env_index in range(buffer.n_envs)]
         self._recorder = StepRecorder(self.credit, self.model.observation_space, self.model.action_space, env_ids)
-        self.steps = []
+        self.step_ids = []
         if self.model.num_timesteps == 0:  # every environment was reset
             for env_index in range(buffer.n_envs):
                 self._recorder.drop(env_index)
         self._observation = self._original_observation(self.model._last_obs)
-        # The algorithm calls this method between the rollout and the update. No callback is called there.
+        # The algorithm calls this method between the rollout and the update. No callback is called there: PPO's `on_rollout_end` comes
+        # after it, and MaskablePPO and RecurrentPPO do not tell callbacks the last values before.
         buffer.compute_returns_and_advantage = self._compute_returns_and_advantage
 
     def _on_training_end(self) -> None:
         vars(self.model.rollout_buffer).pop("compute_returns_and_advantage", None)  # pyright: ignore[reportAttributeAccessIssue]
 
     def _on_step(self) -> bool:
-        normalize, values, done = self.model.get_vec_normalize_env(), self.locals, self.locals["dones"]
-        reward = values["rewards"] if normalize is None else normalize.get_original_reward()
-        observation = self._original_observation(values["new_obs"])
+        normalize, rollout, done = self.model.get_vec_normalize_env(), self.locals, self.locals["dones"]
+        reward = rollout["rewards"] if normalize is None else normalize.get_original_reward()
+        observation = self._original_observation(rollout["new_obs"])
         next_observation = deepcopy(observation)
         for env_index in np.flatnonzero(done):
-            last = values["infos"][env_index].get("terminal_observation")
+            last = rollout["infos"][env_index].get("terminal_observation")
             if last is not None:
                 _set_row(next_observation, env_index, last if normalize is None else normalize.unnormalize_obs(last))
-        env_action = values.get("clipped_actions", values["actions"])  # MaskablePPO does not clip actions
-        steps = self._observation, env_action, next_observation
-        self.steps.append(self._recorder.add(*steps, reward, done, np.zeros_like(done), infos=values["infos"]))
+        env_action = rollout.get("clipped_actions", rollout["actions"])  # MaskablePPO does not clip actions
+        transition = self._observation, env_action, next_observation
+        self.step_ids.append(self._recorder.add(*transition, reward, done, np.zeros_like(done), infos=rollout["infos"]))
         self._observation = observation
         # The algorithm itself writes this array into its buffer, and adds gamma V(s') to it at time limits.
-        values["rewards"][:] = 0
+        rollout["rewards"][:] = 0
         return True
 
     def _compute_returns_and_advantage(self, last_values: Any, dones: np.ndarray) -> None:
         """Replace the method of the rollout buffer while the model learns: add r_hat first."""
         buffer: Any = self.model.rollout_buffer  # pyright: ignore[reportAttributeAccessIssue]
-        steps, self.steps = self.steps, []
-        if len(steps) != buffer.buffer_size:
-            raise LareError(
-                f"CreditCallback saw {len(steps)} of the {buffer.buffer_size} steps of a rollout: "
-                "give it to learn() directly, or in a list, not within another callback"
-            )
-        self.credit.fit(self.updates)
-        buffer.rewards += self.credit.rewards_at(np.stack(steps))
+        step_ids, self.step_ids = self.step_ids, []
+        if len(step_ids) == buffer.buffer_size:
+            self.credit.fit(self.updates)
+            buffer.rewards += self.credit.rewards_at(np.stack(step_ids))
+            self._record_metrics()
+        else:  # an earlier `learn` was interrupted, and this one has no such callback
+            self._on_training_end()
+        type(buffer).compute_returns_and_advantage(buffer, last_values=last_values, dones=dones)
+
+    def _record_metrics(self) -> None:
         metrics = self.credit.metrics()
         if not metrics["credit/episodes"]:
             warnings.warn(
-                f"no episode has ended in {buffer.buffer_size} steps, so all rewards are 0: n_steps should hold several episodes",
-                stacklevel=2,
+                "no episode has ended yet, so the rewards say nothing: n_steps should hold several episodes",
+                stacklevel=3,
             )
         for name, value in metrics.items():
             self.logger.record(name, value)
-        type(buffer).compute_returns_and_advantage(buffer, last_values=last_values, dones=dones)
 
     def _original_observation(self, observation: Any) -> Any:
         """Return the environment's last observation, before any normalisation."""

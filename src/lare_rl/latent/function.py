@@ -27,7 +27,7 @@ from lare_rl.util.rows import as_numbers, as_rows
 
 __all__ = [
     "CHANGED_SUFFIX", "HEADER_PREFIX", "LatentFunction", "check_task", "features_text", "function_from_verdict",
-    "normalise_source", "pair_with_roles", "python_file", "source_hash", "verify_function",
+    "lines_before_code", "normalise_source", "pair_with_roles", "python_file", "source_hash", "verify_function",
 ]  # fmt: skip
 
 CHANGED_SUFFIX = "; changed by hand since"
@@ -219,14 +219,20 @@ def function_from_verdict(source: str, task: TaskSpec, kind: FunctionKind, verdi
 
 
 def normalise_source(source: str) -> str:
-    r"""Return a source as it is saved: lines end with \n, no empty lines around it, and no header.
+    r"""Return a source as it is saved: lines end with \n, no empty lines around it, and no lines of a header.
 
     A line ends where Python's parser ends it, and nowhere else. Variation selectors, which make an emoji of a sign, are
     removed: models write warning signs into comments, and a variation selector is invisible.
     """
     lines = source.replace(_VARIATION_SELECTOR, "").replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    body = itertools.dropwhile(lambda line: not line or line.startswith(HEADER_PREFIX), lines)
-    return "\n".join(body).rstrip("\n")
+    comments = lines_before_code(lines)
+    body = [line for line in comments if not line.startswith(HEADER_PREFIX)] + lines[len(comments) :]
+    return "\n".join(body).strip("\n")
+
+
+def lines_before_code(lines: Sequence[str]) -> list[str]:
+    """Return the comments and the empty lines on top of a source. A header is among them."""
+    return list(itertools.takewhile(lambda line: not line or line.startswith("#"), lines))
 
 
 def source_hash(source: str) -> str:

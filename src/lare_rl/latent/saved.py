@@ -1,10 +1,9 @@
 """Reads the files that `LatentFunction.save` writes: `phi` (.py), and its model and replies (.json). Every `phi` is verified again."""
 
-import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast, get_args
 
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError, short_repr
@@ -12,7 +11,9 @@ from lare_rl.latent.function import (
     CHANGED_SUFFIX,
     HEADER_PREFIX,
     LatentFunction,
+    lines_before_code,
     normalise_source,
+    python_file,
     source_hash,
     verify_function,
 )
@@ -47,7 +48,7 @@ class SavedSource(NamedTuple):
 
 def read_source(path: str | Path) -> SavedSource:
     """Read the source of a function file, or of a model's reply (.json). Raises `LareError` if the file cannot be read."""
-    header, source = _read_header(_find_file(path))
+    header, source = _split_file(_find_file(path))
     return SavedSource(source=source, changed=_was_changed(header, source), task=header.get("task"))
 
 
@@ -66,15 +67,17 @@ def load_function(path: str | Path, task: TaskSpec | str | Path, steps: Steps | 
         LareError: the file cannot be read, or the function does not pass for this task.
     """
     file, task = _find_file(path), resolve_task(task, playable=steps is None)
-    header, source = _read_header(file)
+    header, source = _split_file(file)
     saved_task = header.get("task")
     if saved_task not in (None, task.name):
         raise LareError(
             f"{file} was written for the task {saved_task!r}, not for {task.name!r}. If the function is "
             f'right for both tasks, remove the line "{HEADER_PREFIX}task: {saved_task}"'
         )
-    kind: FunctionKind = "reward" if header.get("kind") == "reward" else "factors"
-    function = verify_function(source, task, kind, steps, file)
+    kind = header.get("kind", "factors")
+    if kind not in get_args(FunctionKind):
+        raise LareError(f'{file}: "{HEADER_PREFIX}kind:" is {short_repr(kind)}, and must be factors or reward')
+    function = verify_function(source, task, cast("FunctionKind", kind), steps, file)
     if file.suffix == ".json":
         return replace(function, model=_UNNAMED_LLM)
     function = replace(function, model=header.get("model") or function.model)
@@ -89,24 +92,29 @@ def _find_file(path: str | Path) -> Path:
     if not isinstance(path, (str, Path)):
         raise LareError(f"a latent function is read from the path of a file, not from {short_repr(path)}")
     path = Path(path)
-    python = path.with_suffix(".py") if path.suffix == ".json" else path
-    for file in (python, path):
+    python_path = python_file(path)
+    for file in (python_path, path):
         if file.is_file():
             return file
-    raise LareError(f"the function file {python} {'is not a file' if python.exists() else 'does not exist'}")
+    if path.exists():
+        raise LareError(f"{path} is not a file")
+    raise LareError(
+        f"the function file {path} does not exist{'' if python_path == path else f', nor {python_path.name}'}"
+    )
 
 
-def _read_header(file: Path) -> tuple[dict[str, str], str]:
+def _split_file(file: Path) -> tuple[dict[str, str], str]:
     """Return what `save` wrote above a source, by key, and the source: of a Python file, or of a model's reply."""
     text = read_text(file, _MAX_FILE_BYTES)
     if file.suffix == ".json":
         try:
             text = parse_reply(text).functions
         except MalformedReplyError as error:
-            python = file.with_suffix(".py")
-            raise LareError(f"{file} is not a model's reply ({error}), and {python} does not exist") from error
-    lines = list(itertools.takewhile(lambda line: line.startswith(HEADER_PREFIX), text.split("\n")))
-    pairs = (line.removeprefix(HEADER_PREFIX).partition(": ") for line in reversed(lines))
+            python_path = file.with_suffix(".py")
+            raise LareError(f"{file} is not a model's reply ({error}), and {python_path} does not exist") from error
+    header = [line for line in lines_before_code(text.splitlines()) if line.startswith(HEADER_PREFIX)]
+    # Of a key that occurs twice, the first line counts.
+    pairs = (line.removeprefix(HEADER_PREFIX).partition(": ") for line in reversed(header))
     return {key: value.strip() for key, _, value in pairs}, normalise_source(text)
 
 
@@ -114,17 +122,18 @@ def _was_changed(header: dict[str, str], source: str) -> bool:
     return header.get("sha256") not in (None, source_hash(source))
 
 
-def _add_provenance(function: LatentFunction, record: Path) -> LatentFunction:
-    """Add the model and the replies from the .json beside the source. If the source differs, add a suffix to the model's name."""
-    if not record.is_file():
+def _add_provenance(function: LatentFunction, json_file: Path) -> LatentFunction:
+    """Add the model and the replies from the .json beside the source. The model's name says if the source was changed since."""
+    if not json_file.is_file():
         return function
     try:
-        saved = read_json(read_text(record))
+        saved = read_json(read_text(json_file))
         json.dumps(saved, ensure_ascii=False).encode()  # half of a surrogate pair can be read but not written
         model = saved["model"] if saved["source"] == function.source else saved["model"] + CHANGED_SUFFIX
         exchanges = tuple(Exchange(**exchange).model_dump() for exchange in saved["exchanges"])
         if not isinstance(model, str):
             raise TypeError("model")
     except (LareError, ValueError, KeyError, TypeError) as error:
-        raise LareError(f"{record} is not the record of a latent function: {short_repr(error)}") from error
+        reason = f"it has no {error}" if isinstance(error, KeyError) else short_repr(error)
+        raise LareError(f"{json_file} does not describe {json_file.with_suffix('.py').name}: {reason}") from error
     return replace(function, model=model, exchanges=exchanges)

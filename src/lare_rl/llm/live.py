@@ -2,8 +2,8 @@
 
 limits       of time and size: see `http_limits`; of requests, tokens and waiting: see `budget`
 redirects    to another server are refused, because it would receive the request
-retries      408, 409, 429, 5xx and broken connections, with back-off or after the time that the server names
-requests     of the strictest form that the server supports: see `request_forms`
+retries      408, 409, 429, 5xx and broken connections, with back-off or after Retry-After, at most 60 s
+requests     in the strictest form (API, and how the reply is structured) that the server supports: see `request_forms`
 replies      are parsed by `reply`, whatever the form of the request
 the key      see `key`
 """
@@ -29,21 +29,23 @@ from lare_rl.llm.key import KEY_VARIABLE, api_key, redact_key
 from lare_rl.llm.prompts import Message
 from lare_rl.llm.request_forms import MIN_REPLY_TOKENS, FailedResponseError, RequestForms
 from lare_rl.util.safe_io import read_json
-from lare_rl.util.sanitize import one_line, replace_surrogates
+from lare_rl.util.sanitize import abbreviate, one_line, replace_surrogates
 from lare_rl.util.variables import read_variable
 
 __all__ = ["LiveModel", "ModelError"]
 
 _MAX_ATTEMPTS = 6
 _MAX_PAUSE_S = 60.0
+"""The longest pause before another attempt, even if the server asks for a longer one."""
+_OPENAI_URL = "https://api.openai.com/v1"
 _MAX_EXCERPT, _MAX_MESSAGE = 200, 500
 """Characters of an answer that a message quotes, and of the message."""
 
 _RETRIED_STATUSES = {408, 409, 429}
 
-# Errors of the HTTP library by the beginnings of their names, because the library depends on the client's version.
+# Errors by the beginnings of their names: the HTTP library (httpx or its successor) depends on the version of OpenAI's client.
 _PERMANENT_ERRORS = ("UnsupportedProtocol", "InvalidURL", "LocalProtocolError")
-_NOT_SENT_ERRORS = ("Connect", *_PERMANENT_ERRORS)
+_NOT_SENT_ERRORS = ("ConnectError", "ConnectTimeout", *_PERMANENT_ERRORS)
 
 
 class ModelError(LareError):
@@ -56,7 +58,7 @@ class _Failure(NamedTuple):
     message: str
     retry: bool
     """Whether a further attempt may succeed."""
-    pause_s: float | None = None
+    retry_after_s: float | None = None
     """The pause that the server asks for before the next attempt."""
     request_changed: bool = False
     """Whether the next request has another form. It is sent at once and does not count as an attempt."""
@@ -90,12 +92,15 @@ class LiveModel:
             raise ModelError(f"{self.name!a} is not the name of a model")
         if not re.fullmatch(r"[!-~]*", api_key()):
             raise ModelError(f"the environment variable {KEY_VARIABLE} holds characters that no key can have")
-        self.base_url = self.base_url or read_variable("OPENAI_BASE_URL") or None
-        if not api_key() and self.base_url is None:
+        self.base_url = self.base_url or read_variable("OPENAI_BASE_URL")
+        if not api_key() and not self.base_url:
             raise ModelError(
                 f"to ask {self.name!r}, put a key into the environment variable {KEY_VARIABLE}, or name a server of "
                 "your own with --base-url (http://localhost:11434/v1 for Ollama)"
             )
+        self.base_url = (
+            self.base_url or _OPENAI_URL
+        )  # without an address, the client would take even an empty OPENAI_BASE_URL
         try:
             self._client = self._connect()
         except ImportError:
@@ -114,9 +119,7 @@ class LiveModel:
             api_key=api_key() or "none",
             base_url=self.base_url,
             max_retries=0,
-            http_client=openai.DefaultHttpxClient(
-                event_hooks={"response": [check_response]}, timeout=self.budget.reply_timeout_s
-            ),
+            http_client=openai.DefaultHttpxClient(event_hooks={"response": [check_response]}),
             default_headers={"Accept-Encoding": "identity"},  # answers that are not compressed need no unpacking
         )
 
@@ -128,20 +131,22 @@ class LiveModel:
             BudgetExceededError: the budget does not allow another request, or its time is over.
         """
         self.on_message(f"{self.name}: waiting for a reply, {self.budget.timeout_text()}")
-        attempts, patience, cause = 0, 1, ""
+        attempts, timeout_factor, cause = 0, 1, ""
         while True:
             try:
-                result = self._request(messages, min(patience * self.budget.reply_timeout_s, self.budget.seconds_left))
+                result = self._request(
+                    messages, min(timeout_factor * self.budget.reply_timeout_s, self.budget.seconds_left)
+                )
                 if isinstance(result, str):
                     return redact_key(result)
                 cause = f"; the last attempt failed: {result.message}"
                 if result.request_changed:
                     continue
                 attempts += 1
-                patience *= 2 if result.timed_out else 1
+                timeout_factor *= 2 if result.timed_out else 1
                 if not result.retry or attempts == _MAX_ATTEMPTS:
                     raise ModelError(f"{self.name} did not answer: {result.message}")
-                pause_s = result.pause_s or 0.5 * 2 ** (attempts - 1)
+                pause_s = result.retry_after_s or 0.5 * 2 ** (attempts - 1)
                 self.budget.add_pause(pause_s)
                 self.on_message(f"{self.name}: {result.message}; trying again in {pause_s:.1f} s")
                 self.sleep(pause_s)
@@ -187,7 +192,7 @@ class LiveModel:
             return _Failure(_safe_text(f"{reason}: {page}"), retry=True, request_changed=is_missing)
         self.forms = replace(self.forms, is_verified=True)
         text = replace_surrogates(answer.text)
-        self.budget.count_reply(answer.usage, messages, len(text.encode()))
+        self.budget.count_reply(answer.usage, messages, len(body))  # of the whole body, which may hold hidden reasoning
         if answer.is_cut_off:
             self.on_message(f"{self.name}: a reply was cut off at the {max_tokens:,} tokens that it was allowed")
         return text
@@ -196,7 +201,7 @@ class LiveModel:
         """Describe the error of a request, and count the most that the request may have cost."""
         name = type(error).__name__
         if isinstance(error, StatusError):
-            return self._refusal(error)
+            return self._http_error(error)
         if isinstance(error, RedirectError):
             return _Failure(_safe_text(error), retry=False)
         if isinstance(error, ValueError):  # half of a surrogate pair in a message, or a temperature that is not finite
@@ -213,16 +218,16 @@ class LiveModel:
         self.budget.count_reply(None, messages, max_tokens)  # the server may have answered
         return _Failure(_safe_text(f"{name}: {error}"), retry=True, timed_out="Timeout" in name)
 
-    def _refusal(self, error: StatusError) -> _Failure:
+    def _http_error(self, error: StatusError) -> _Failure:
         """Handle an HTTP error: change the request, wait, or give up."""
         message = _safe_text(f"HTTP {error.status}: {_error_text(error.body)}")
-        forms = self.forms.after_refusal(error.status, error.body.lower(), self.temperature is not None)
+        forms = self.forms.after_http_error(error.status, error.body.lower(), self.temperature is not None)
         if forms is not None:
             self.forms = forms
             return _Failure(message, retry=True, request_changed=True)
         may_recover = error.status in _RETRIED_STATUSES or error.status >= 500
         retry = may_recover and "insufficient_quota" not in error.body
-        return _Failure(message, retry, pause_s=_retry_after_s(error.headers))
+        return _Failure(message, retry, retry_after_s=_retry_after_s(error.headers))
 
 
 def _safe_text(text: object) -> str:
@@ -236,8 +241,8 @@ def _without_password(url: str) -> str:
 
 
 def _excerpt(body: str) -> str:
-    text = one_line(redact_key(body[:2000]))  # before the cut, which could leave a part of the key
-    return repr(text if len(text) <= _MAX_EXCERPT else f"{text[:_MAX_EXCERPT]}...")
+    text = one_line(redact_key(body))  # before it is cut, because a cut could leave a part of the key
+    return repr(abbreviate(text, _MAX_EXCERPT))
 
 
 def _error_text(body: str) -> str:

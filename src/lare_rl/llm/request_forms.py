@@ -102,7 +102,7 @@ class RequestForms:
         """Return the forms of chat completions."""
         return replace(self, forms=tuple(form for form in self.forms if form.api == "chat"), is_verified=False)
 
-    def after_refusal(self, status: int, reason: str, has_temperature: bool) -> "RequestForms | None":
+    def after_http_error(self, status: int, reason: str, has_temperature: bool) -> "RequestForms | None":
         """Return the forms after a refused request, or None if nothing is left to change.
 
         Args:

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 from gymnasium.spaces import Box, Discrete
 
+from lare_rl.envs.env_errors import NoTimeLimitError
 from lare_rl.envs.families import FAMILIES
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.envs.jaxmarl_env import JaxMARLEnv
 from lare_rl.envs.jumanji_env import observed_arrays
-from lare_rl.errors import LareError
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import single_agent_lines, split_sections, write_texts
 from lare_rl.new_task.draft import Draft, count_entries, file_name
@@ -23,41 +23,47 @@ from lare_rl.new_task.many_agents import make_stub, write_team_drafts
 
 __all__ = ["draft_jax_task"]
 
-FIELD = re.compile(r"^- (observation|action|reward|episode termination|state)s?:", re.MULTILINE)
+SECTION_START = re.compile(
+    r"^ ?- (observation|action|reward|episode termination|state)s?(?: \(if any\))?:", re.MULTILINE
+)
 """The start of a section in Jumanji's documentation."""
-MULTI_DISCRETE = re.compile(r"multi.?discrete array of shape", re.IGNORECASE)
-"""The shape of an action in the package, which is another one here."""
+MULTI_DISCRETE = re.compile(r"multi.?discrete.?array( \(\w+\))? of shape", re.IGNORECASE)
+"""A line with the shape of an action of several choices. LaRe makes one choice of them, so the shape would mislead."""
 
 
 def draft_jax_task(environment_id: str) -> Draft:
-    """Draft a task file from an environment's documentation and sizes. Raises `LareError` if it cannot be made."""
+    """Draft a task file from an environment's documentation and sizes.
+
+    Args:
+        environment_id: family and name, such as `jumanji/Snake-v1`. The family must be registered.
+
+    Raises:
+        LareError: the environment cannot be made.
+    """
     family, _, name = environment_id.partition("/")
     make: Callable[..., Any] = FAMILIES[family].load_maker()
     stub = make_stub(name, environment_id)
     limit: dict[str, int] = {}
     try:
         env = make(stub)
-    except LareError as error:
+    except NoTimeLimitError:
         limit = {"max_episode_steps": draft.DEFAULT_LIMIT}
-        try:
-            env = make(stub.model_copy(update=limit))
-        except LareError:
-            raise error from None
+        env = make(stub.model_copy(update=limit))
     texts, removed = _read_texts(env)
     limit_lines = [draft.LIMIT_LINE] if limit else []
     if isinstance(env, JaxMARLEnv):
         env = make(make_stub(name, environment_id, env.layout.index, **limit))
         return write_team_drafts(file_name(name), environment_id, env, texts, removed, limit_lines)
-    name, sizes = file_name(name), (env.spec.observation_size, env.spec.action_size)
-    lines = [*draft.head_lines(name, environment_id, sizes, removed), draft.SCORE_LINE, *limit_lines]
+    task_name, sizes = file_name(name), (env.spec.observation_size, env.spec.action_size)
+    lines = [*draft.head_lines(task_name, environment_id, sizes, removed), draft.SCORE_LINE, *limit_lines]
     space_descriptions = {"observation": _describe_observation(env, family), "action": _describe_action(env.spec)}
-    return draft.make_draft(name, lines, texts, space_descriptions, removed)
+    return draft.make_draft(task_name, lines, texts, space_descriptions, removed)
 
 
 def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
     """Return the texts by their keys, and the removed lines, from the docstring of the package's class."""
     documentation = inspect.cleandoc(type(env.env).__doc__ or "")
-    sections = split_sections(FIELD.sub(_heading, documentation))
+    sections = split_sections(SECTION_START.sub(_heading, documentation))
     lines = single_agent_lines(sections)
     rows = [line for line in _without_mask(lines["observation"]) if not line.startswith("Observation")]
     actions = [line for line in lines["action"] if not MULTI_DISCRETE.match(line)]
@@ -106,10 +112,12 @@ def _describe_choices(sizes: tuple[int, ...]) -> str:
     letters = string.ascii_lowercase[: len(sizes)]
     factors = [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
     entry = " + ".join(
-        f"{factor} {letter}" if factor > 1 else letter for factor, letter in zip(factors, letters, strict=True)
+        f"{factor} {letter}" if factor > 1 else letter
+        for factor, letter, n in zip(factors, letters, sizes, strict=True)
+        if n > 1
     )
     choices = [
-        f"choice {i} is {letter}, from 0 to {n - 1}"
+        f"choice {i} is {letter}, from 0 to {n - 1}" if n > 1 else f"choice {i} is always 0"
         for i, (letter, n) in enumerate(zip(letters, sizes, strict=True), 1)
     ]
     return f"Entry {entry}: {'; '.join(choices)}."

@@ -55,9 +55,12 @@ def update_mean_std(
 def merge_means(n: Any, mean: Any, n_new: Any, new_mean: Any, square: Any = lambda d: d**2) -> tuple[Any, Any, Any]:
     """Merge the mean of `n` old rows and that of `n_new` new rows.
 
-    Return the number of all rows, their mean, and d^2 n n_new / (n + n_new), where d is the difference of the two means. Added to the sums
-    of squared deviations of the old and of the new rows, the last value gives that of all rows. `square` computes d^2; for products of
-    features it is the outer product. The parallel update of Chan, Golub and LeVeque (1983), which avoids catastrophic cancellation.
+    Return the number of all rows, their mean, and `between` = d^2 n n_new / (n + n_new), where d is the difference of the two means:
+
+        sum of squares of all rows = that of the old rows + that of the new rows + between
+
+    Means have the shape (features,), and so has `between`; with `square=jnp.outer` it is (features, features), for sums of products of
+    deviations. The parallel update of Chan, Golub and LeVeque (1983), which avoids catastrophic cancellation.
     """
     n_all, difference = n + n_new, new_mean - mean
     fraction = n_new / jnp.maximum(n_all, 1)
@@ -65,13 +68,16 @@ def merge_means(n: Any, mean: Any, n_new: Any, new_mean: Any, square: Any = lamb
 
 
 def running_std(statistics: RunningMeanStd) -> Float[Array, "*features"]:
-    """Return the standard deviation of each feature: 0 for a feature that has never varied."""
+    """Return the standard deviation of each feature (divided by n).
+
+    It is 0 if it is at most `FLOAT32_NOISE` of the mean, which float32 cannot tell from no variation.
+    """
     std = jnp.sqrt(statistics.sum_squares / jnp.maximum(statistics.n_rows, 1))
     return jnp.where(std > FLOAT32_NOISE * jnp.abs(statistics.mean), std, 0)
 
 
 def standardise(statistics: RunningMeanStd, rows: Float[Array, "*batch features"]) -> Float[Array, "*batch features"]:
-    """Return (x - mean) / std, clipped to ±`CLIP`. A feature that has never varied becomes 0."""
+    """Return (x - mean) / std, clipped to ±`CLIP`. A feature without variation (`running_std`) becomes 0."""
     std = running_std(statistics)
     scaled = (rows - statistics.mean) / jnp.where(std > 0, std, 1)
     return jnp.where(std > 0, jnp.clip(scaled, -CLIP, CLIP), 0)
@@ -101,24 +107,24 @@ def empty_scale() -> Scale:
 def update_scale(scale: Scale, values: Float[Array, " batch"], mask: Bool[Array, " batch"]) -> Scale:
     """Add the values where `mask` is true."""
     n_episodes = scale.n_episodes + jnp.sum(mask)
-    excess = jnp.sum(jnp.where(mask, values**2 - scale.mean_square, 0))
-    had_episodes, has_episodes = scale.n_episodes > 0, n_episodes > 0
-    lowest = jnp.min(values, where=mask, initial=jnp.where(had_episodes, scale.lowest, jnp.inf))
-    highest = jnp.max(values, where=mask, initial=jnp.where(had_episodes, scale.highest, -jnp.inf))
+    square_differences = jnp.sum(jnp.where(mask, values**2 - scale.mean_square, 0))
+    was_empty, is_empty = scale.n_episodes == 0, n_episodes == 0
+    lowest = jnp.min(values, where=mask, initial=jnp.where(was_empty, jnp.inf, scale.lowest))
+    highest = jnp.max(values, where=mask, initial=jnp.where(was_empty, -jnp.inf, scale.highest))
     return Scale(
         n_episodes=n_episodes,
-        mean_square=scale.mean_square + excess / jnp.maximum(n_episodes, 1),
-        lowest=jnp.where(has_episodes, lowest, 0),
-        highest=jnp.where(has_episodes, highest, 0),
+        mean_square=scale.mean_square + square_differences / jnp.maximum(n_episodes, 1),
+        lowest=jnp.where(is_empty, 0, lowest),
+        highest=jnp.where(is_empty, 0, highest),
     )
 
 
 def min_max_scale(scale: Scale, values: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return (x - lowest) / (highest - lowest), or 0.5 while lowest and highest are the same."""
+    """Return (x - lowest) / (highest - lowest), or 0.5 while lowest and highest are the same. Values outside are not clipped."""
     width = scale.highest - scale.lowest
     return jnp.where(width > 0, (values - scale.lowest) / jnp.where(width > 0, width, 1), 0.5)
 
 
 def root_mean_square(scale: Scale) -> Float[Array, ""]:
-    """Return the root mean square of the values, or 1 while all of them are 0."""
+    """Return the root mean square of the values, or 1 while their squares are 0."""
     return jnp.where(scale.mean_square > 0, jnp.sqrt(scale.mean_square), 1)

@@ -13,7 +13,7 @@ from lare_rl.phi.limits import MAX_INT_BITS, RefusedError
 from lare_rl.phi.numpy_functions import INDEXED, call_numpy
 from lare_rl.phi.operand import Operand
 from lare_rl.phi.runtime import BINARY, Runtime, check_key, check_number, check_text, make_set
-from lare_rl.phi.text import combine_values, format_value
+from lare_rl.phi.text import combine_values, format_value, represent_value
 from lare_rl.phi.values import Class, Function, Instance, Iterator, Scope, Set, Symbol, describe
 
 __all__ = ["apply_binary", "evaluate", "get_item", "list_items", "test_truth"]
@@ -169,9 +169,11 @@ def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
             for value in values:
                 text = check_text(text + runtime.evaluate(value, scope))
             return text
-        case ast.FormattedValue(value=value, format_spec=spec):
-            format_spec = "" if spec is None else runtime.evaluate(spec, scope)
-            return format_value(runtime.meter, runtime.evaluate(value, scope), format_spec)
+        case ast.FormattedValue(value=value, conversion=conversion, format_spec=spec):
+            format_spec, value = "" if spec is None else runtime.evaluate(spec, scope), runtime.evaluate(value, scope)
+            if conversion in (ord("r"), ord("a")):
+                value = represent_value(runtime.meter, value)
+            return format_value(runtime.meter, value, format_spec)
         case ast.Yield() | ast.YieldFrom():
             return _evaluate_yield(runtime, node, scope)
     raise RefusedError("E-PYTHON", f"{type(node).__name__.lower()} is not available")

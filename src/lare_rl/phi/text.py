@@ -14,7 +14,7 @@ from lare_rl.phi.operand import Operand
 from lare_rl.phi.runtime import Meter, Runtime, check_key, check_text, check_text_length, make_set
 from lare_rl.phi.values import Set, Symbol, value_type
 
-__all__ = ["METHODS", "call_method", "combine_values", "format_value"]
+__all__ = ["METHODS", "call_method", "combine_values", "format_value", "represent_value"]
 
 FORMAT = re.compile(r"[<>^=]?[-+ ]?#?0?\d{0,2}[,_]?(\.\d{1,2})?[bdeEfFgGnosxX%]?")
 """Format specifications of limited width."""
@@ -36,28 +36,44 @@ def format_value(meter: Meter, value: Any, spec: str) -> str:
     """Return the text of a value: "<array>" for an array, unless it is constant."""
     if isinstance(value, Array) and value.constant is not None and not spec:
         value = value.constant.tolist()
-    if isinstance(value, Operand):
-        return "<array>"
-    meter.pay_for_all_within([value])
     if not FORMAT.fullmatch(spec):
         raise RefusedError("E-PYTHON", f"the format {spec[:40]!r} is not available")
-    if isinstance(value, (bool, int, float, str)):
+    if isinstance(value, str) or (spec and isinstance(value, (bool, int, float))):
+        meter.pay_for_all_within([value])
         return check_text(format(value, spec))
+    return represent_value(meter, value)
+
+
+def represent_value(meter: Meter, value: Any) -> str:
+    """Return the text of a value as `repr` does."""
+    meter.pay_for_all_within([value])
     check_text_length(_text_length(value))
-    return check_text(str(value)) if _is_plain(value) else f"<{value_type(value)}>"
+    return check_text(_represent(value))
 
 
 def _text_length(value: Any) -> int:
     """Return an estimate of the length of a value's text."""
+    if isinstance(value, dict):
+        return _text_length([*value, *value.values()])
     if isinstance(value, (list, tuple)):
         return sum(map(_text_length, value))
     return 4 * len(value) if isinstance(value, str) else 4
 
 
-def _is_plain(value: Any) -> bool:
-    if isinstance(value, (list, tuple)):
-        return all(map(_is_plain, value))
-    return isinstance(value, (bool, int, float, str, Symbol, BatchSize)) or value is None
+def _represent(value: Any) -> str:
+    if isinstance(value, Operand):
+        return "<array>"
+    if isinstance(value, (bool, int, float, str, Symbol, BatchSize)) or value is None:
+        return repr(value) if isinstance(value, str) else str(value)
+    if isinstance(value, Set):
+        return f"{{{', '.join(map(_represent, value))}}}" if value else "set()"
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{_represent(key)}: {_represent(entry)}' for key, entry in value.items())}}}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_represent, value))}]"
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_represent, value))}{',' if len(value) == 1 else ''})"
+    return f"<{value_type(value)}>"
 
 
 def combine_values(meter: Meter, name: str, x: Any, y: Any) -> Any:

@@ -22,9 +22,10 @@ from typing import Any
 from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.runs.directory import RunBusyError
 from lare_rl.sweep.jobs import Job, describe_job, train_job
-from lare_rl.sweep.resources import PREALLOCATE, Resources, Slot, assign_slots, last_line
+from lare_rl.sweep.resources import PREALLOCATE, Resources, Slot, assign_slots
 from lare_rl.util.files import make_directory
 from lare_rl.util.processes import own_session
+from lare_rl.util.sanitize import last_line
 
 __all__ = ["RunningProcesses", "train_in_process", "train_in_processes", "train_on_ray"]
 

@@ -10,9 +10,9 @@ from pydantic import AfterValidator, Field
 
 from lare_rl.errors import CheckedModel, Count, LareError, short_repr
 from lare_rl.util.processes import usable_cores
-from lare_rl.util.sanitize import one_line
+from lare_rl.util.sanitize import last_line, one_line
 
-__all__ = ["Resources", "Slot", "assign_accelerators", "assign_cores", "assign_slots", "last_line"]
+__all__ = ["Resources", "Slot", "assign_accelerators", "assign_cores", "assign_slots"]
 
 VISIBLE_ACCELERATORS = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES")
 """The variables that choose the accelerators which a process sees, one for each vendor."""
@@ -56,7 +56,8 @@ def assign_slots(resources: Resources) -> list[Slot]:
     cores = assign_cores(resources.processes, resources.cores)
     if resources.accelerators is None and resources.processes == 1:  # JAX uses all accelerators
         return [Slot(cores[0], {})]
-    accelerators = assign_accelerators(resources.processes, resources.accelerators, _count_accelerators(), os.environ)
+    available = 0 if resources.accelerators == 0 else _count_accelerators()
+    accelerators = assign_accelerators(resources.processes, resources.accelerators, available, os.environ)
     return [Slot(*pair) for pair in zip(cores, accelerators, strict=True)]
 
 
@@ -77,49 +78,50 @@ def assign_cores(processes: int, cores: int) -> list[list[int]]:
 
 
 def assign_accelerators(
-    processes: int, accelerators: float | None, n_accelerators: int, variables: Mapping[str, str]
+    processes: int, per_process: float | None, available: int, environ: Mapping[str, str]
 ) -> list[dict[str, str]]:
     """Return the environment variables that choose the accelerators of each process.
 
     Args:
-        accelerators: the accelerators of each process; by default an equal share.
-        variables: the environment variables of this process, which may choose some of the machine's accelerators.
+        per_process: the accelerators of each process; by default an equal share.
+        available: the number of accelerators that JAX sees here. It is not used if `per_process` is 0.
+        environ: the environment variables of this process, which may choose some of the machine's accelerators.
 
     Raises:
         LareError: there are not enough accelerators.
     """
-    share = n_accelerators / processes if accelerators is None else accelerators
-    n_processes_per_accelerator = int(min(processes, 1 / share)) if 0 < share < 1 else 1
-    max_processes = n_accelerators * n_processes_per_accelerator // max(1, int(share))
-    if accelerators and processes > max_processes:
+    if per_process == 0:
+        return [dict.fromkeys(VISIBLE_ACCELERATORS, "") for _ in range(processes)]
+    share = available / processes if per_process is None else per_process
+    is_shared = 0 < share < 1
+    max_processes = available * int(min(processes, 1 / share)) if is_shared else available // max(1, int(share))
+    if per_process is not None and processes > max_processes:
         raise LareError(
-            f"{processes} processes with {accelerators:g} accelerators each need more than the {n_accelerators} accelerators that "
+            f"{processes} processes with {per_process:g} accelerators each need more than the {available} accelerators that "
             "are usable here: lower processes or accelerators"
         )
-    if not n_accelerators:
+    if not available:
         return [{} for _ in range(processes)]
-    return [_accelerator_variables(process, share, n_accelerators, variables) for process in range(processes)]
+    return [_accelerator_variables(process, share, available, environ) for process in range(processes)]
 
 
-def _accelerator_variables(
-    process: int, share: float, n_accelerators: int, variables: Mapping[str, str]
-) -> dict[str, str]:
-    first = process * int(share)
-    indices = [process % n_accelerators] if 0 < share < 1 else range(first, first + int(share))
+def _accelerator_variables(process: int, share: float, available: int, environ: Mapping[str, str]) -> dict[str, str]:
+    is_shared, first = 0 < share < 1, process * int(share)
+    indices = [process % available] if is_shared else range(first, first + int(share))
     chosen = {}
     for name in VISIBLE_ACCELERATORS:
-        visible = variables[name].split(",") if variables.get(name) else list(map(str, range(n_accelerators)))
-        if len(visible) >= n_accelerators:  # else it chooses accelerators of another vendor
+        visible = environ[name].split(",") if name in environ else list(map(str, range(available)))
+        if len(visible) >= available:  # else it chooses accelerators of another vendor
             chosen[name] = ",".join(visible[index] for index in indices)
-    if 0 < share < 1 and PREALLOCATE not in variables:
+    if is_shared and PREALLOCATE not in environ:
         chosen[PREALLOCATE] = "false"
     return chosen
 
 
 def _count_accelerators() -> int:
-    """Return the number of accelerators that JAX sees. Another process asks JAX, which reserves their memory.
+    """Return the number of accelerators that JAX sees. Raises `LareError` if JAX fails.
 
-    Raises `LareError` if JAX fails in that process.
+    A child process asks, because JAX reserves the accelerators' memory in the process that asks.
     """
     process = subprocess.run(
         [sys.executable, "-P", "-c", COUNT_ACCELERATORS], capture_output=True, encoding="utf-8", errors="replace"
@@ -129,7 +131,3 @@ def _count_accelerators() -> int:
         reason = last_line(process.stderr) or f"exit status {process.returncode}, output {short_repr(count)}"
         raise LareError(f"JAX cannot count the accelerators of this machine: {one_line(reason)}")
     return int(count)
-
-
-def last_line(text: str) -> str:
-    return text.strip().rpartition("\n")[2]

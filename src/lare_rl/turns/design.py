@@ -23,9 +23,9 @@ from lare_rl.util.sanitize import replace_surrogates
 __all__ = ["DesignedTurnPhi", "choose_examples", "design_turn_phi", "turn_request"]
 
 N_EXAMPLES = 5
-"""The largest number of turns that the language model sees."""
+"""The number of turns that `choose_examples` returns at most."""
 MAX_EXCERPT = 1500
-"""Characters of a text of an example."""
+"""The number of characters that are shown of each text of an example, at most."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def design_turn_phi(
     model: Model | ModelFunction,
     *,
     examples: Sequence[Turn] | None = None,
-    record: Path | None = None,
+    record: str | Path | None = None,
 ) -> DesignedTurnPhi:
     """Ask a model for a phi over turns until one passes.
 
@@ -55,17 +55,19 @@ def design_turn_phi(
         tools: the descriptions of its tools, in the form of OpenAI's chat completions.
         turns: the turns that programs are checked on, such as those of some rollouts (`split_turns`).
         model: the language model, as for `lare_rl.design`.
-        examples: the turns that the model sees. The default is five of `turns`, of different tools.
+        examples: the turns that the model sees. The default is at most five of `turns`, of different tools.
         record: the file to which every exchange is written.
 
     Raises:
-        LareError: there are fewer than 2 turns. A `DesignError`, with the replies: no attempt passed, or the model cannot answer.
+        LareError: there are fewer than 2 turns, a tool has no name, `record` exists, or the model does not answer the first
+            request. A `DesignError`, with the replies: no attempt passed, or the model does not answer a later request.
     """
     if len(turns) < 2:
         raise LareError(f"a phi over turns is checked on at least 2 turns, and not on {len(turns)}")
     model = as_model(model)
     request = turn_request(goal, tools, choose_examples(turns) if examples is None else examples)
-    recorder = Recorder("turns", "events", getattr(model, "temperature", None), record)
+    path = None if record is None else Path(record)
+    recorder = Recorder("turns", "events", getattr(model, "temperature", None), path)
     problems = ""
     for attempt in range(MAX_ATTEMPTS):
         with keep_replies(recorder, model):
@@ -84,7 +86,9 @@ def design_turn_phi(
 
 
 def turn_request(goal: str, tools: Sequence[Mapping[str, Any]], turns: Sequence[Turn]) -> list[Message]:
-    """Return the messages that ask for a phi over turns, with example turns. They do not vary, so that replies can be recorded.
+    """Return the messages that ask for a phi over turns, with example turns.
+
+    The same arguments always give the same messages, so that a recorded reply can be found.
 
     Raises:
         LareError: a tool has no name, or parameters that are not JSON.
@@ -99,17 +103,17 @@ def turn_request(goal: str, tools: Sequence[Mapping[str, Any]], turns: Sequence[
 def choose_examples(turns: Sequence[Turn]) -> list[Turn]:
     """Return at most `N_EXAMPLES` turns in their order: the first with each combination of tools, then the second, and so on.
 
-    Turns whose results are those of an earlier turn are left out.
+    Turns with the tools and the results of an earlier turn are left out.
     """
-    ranks, counts, results = [], Counter(), set()
+    candidates, counts, contents = [], Counter(), set()
     for index, turn in enumerate(turns):
-        result = tuple(call.result for call in turn.calls) or (turn.reply,)
-        if result not in results:
-            results.add(result)
-            tools = tuple(call.tool for call in turn.calls)
+        tools = tuple(call.tool for call in turn.calls)
+        content = tools, tuple(call.result for call in turn.calls) or (turn.reply,)
+        if content not in contents:
+            contents.add(content)
             counts[tools] += 1
-            ranks.append((counts[tools], index))
-    return [turns[index] for index in sorted(index for _, index in sorted(ranks)[:N_EXAMPLES])]
+            candidates.append((counts[tools], index))
+    return [turns[index] for index in sorted(index for _, index in sorted(candidates)[:N_EXAMPLES])]
 
 
 def _show_tool(tool: Mapping[str, Any]) -> str:
@@ -123,7 +127,8 @@ def _show_turn(turn: Turn) -> str:
     lines = [f"text: {json.dumps(shorten(turn.text, MAX_EXCERPT), ensure_ascii=False)}"]
     for call in turn.calls:
         lines.append(f"tool: {json.dumps(call.tool, ensure_ascii=False)}")
-        lines.append(f"arguments: {shorten(call.arguments, MAX_EXCERPT)}")
+        arguments = call.arguments if call.arguments.isprintable() else json.dumps(call.arguments, ensure_ascii=False)
+        lines.append(f"arguments: {shorten(arguments, MAX_EXCERPT)}")
         lines.append(f"result: {json.dumps(shorten(call.result, MAX_EXCERPT), ensure_ascii=False)}")
     if turn.reply:
         lines.append(f"the user's answer: {json.dumps(shorten(turn.reply, MAX_EXCERPT), ensure_ascii=False)}")

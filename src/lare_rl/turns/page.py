@@ -16,7 +16,7 @@ from lare_rl.turns.rollouts import Rollout
 from lare_rl.turns.words import MESSAGES, count_decimals
 from lare_rl.util.findings import format_for_reader, render
 from lare_rl.util.provenance import code_version
-from lare_rl.util.sanitize import one_line
+from lare_rl.util.sanitize import abbreviate, one_line
 
 __all__ = ["choose_rollouts", "write_turn_report"]
 
@@ -139,8 +139,7 @@ def _describe_features(features: Mapping[str, float]) -> str:
 
 
 def _shorten(text: str) -> str:
-    line = one_line(text)
-    return line if len(line) <= MAX_CHARACTERS else f"{line[:MAX_CHARACTERS]}..."
+    return abbreviate(one_line(text), MAX_CHARACTERS)
 
 
 def _format_change(number: float, std: float, decimals: int) -> str:

@@ -3,7 +3,7 @@
 import re
 import unicodedata
 
-__all__ = ["first_invisible", "one_line", "replace_surrogates", "sanitize"]
+__all__ = ["abbreviate", "first_invisible", "last_line", "one_line", "replace_surrogates", "sanitize"]
 
 # Invisible letters and marks (Default_Ignorable_Code_Point), and the empty Braille pattern.
 _FILLERS = re.compile(
@@ -11,6 +11,16 @@ _FILLERS = re.compile(
 )
 # Control, format, private use, surrogate, unassigned, line separator, paragraph separator.
 _INVISIBLE_CATEGORIES = frozenset({"Cc", "Cf", "Co", "Cs", "Cn", "Zl", "Zp"})
+
+
+def abbreviate(text: str, length: int) -> str:
+    """Return a text, or its first characters and dots if it is longer than `length`."""
+    return text if len(text) <= length else f"{text[:length]}..."
+
+
+def last_line(text: str) -> str:
+    """Return the last line of a text, without white space at its end."""
+    return text.strip().rpartition("\n")[2]
 
 
 def sanitize(text: str) -> str:

@@ -11,8 +11,8 @@ from typing import Any
 from lare_rl.phi.arrays import Array
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, builtin_variants, check_key, make_set, varies
-from lare_rl.phi.text import format_value
-from lare_rl.phi.values import Bound, Class, Instance, Iterator, Symbol
+from lare_rl.phi.text import format_value, represent_value
+from lare_rl.phi.values import Bound, Class, Instance, Iterator, Symbol, describe
 
 ADDITION = Symbol("operator.add")
 
@@ -45,7 +45,7 @@ def sum_(runtime: Runtime, values: Any, start: Any = 0) -> Any:
 
 
 @builtin_variants({"max": max, "min": min})
-def extreme(function: Callable[..., Any], runtime: Runtime, /, *values: Any, key: Any = None, **default: Any) -> Any:
+def max_or_min(function: Callable[..., Any], runtime: Runtime, /, *values: Any, key: Any = None, **default: Any) -> Any:
     items, name = runtime.items(values[0]) if len(values) == 1 else values, function.__name__
     if varies(items):
         hint = f"use np.{name}imum, or np.{name} along axis=1"
@@ -88,16 +88,27 @@ def filter_(runtime: Runtime, function: Any, values: Any) -> Iterator:
 
 @builtin("zip")
 def zip_(runtime: Runtime, *values: Any, strict: Any = False) -> Iterator:
+    # An iterator that is given twice is read in turn: zip(it, it) makes pairs.
     iterators = {id(value): value for value in values if isinstance(value, Iterator)}
-    entries = {key: iter(runtime.items(value)) for key, value in iterators.items()}  # zip(it, it) makes pairs
+    entries = {key: iter(runtime.items(value)) for key, value in iterators.items()}
     return Iterator(zip(*(entries.get(id(x)) or runtime.items(x) for x in values), strict=bool(strict)))
 
 
 @builtin("next")
 def next_(_: Runtime, iterator: Any, *default: Any) -> Any:
-    if not isinstance(iterator, Iterator) or not (iterator or default):
-        raise TypeError("next() of a value that is no iterator, or has no further entries")
+    if not isinstance(iterator, Iterator):
+        raise TypeError(f"next() of {describe(iterator)}, which is no iterator")
+    if not iterator and not default:
+        raise TypeError("next() of an iterator without further entries: give a default, next(iterator, None)")
     return iterator.pop(0) if iterator else default[0]
+
+
+@builtin("itertools.accumulate")
+def accumulate(runtime: Runtime, values: Any, func: Any = None, **initial: Any) -> Iterator:
+    def combine(x: Any, y: Any) -> Any:
+        return runtime.call(ADDITION if func is None else func, [x, y], {})
+
+    return Iterator(itertools.accumulate(runtime.items(values), combine, **initial))
 
 
 def _map(runtime: Runtime, function: Any, argument_lists: Iterable[Sequence[Any]]) -> Iterator:
@@ -124,7 +135,7 @@ BUILTINS |= {
     "slice": lambda _, *ends: slice(*ends),
     "print": lambda _, *values, **more: None,
     "str": lambda runtime, value="": format_value(runtime.meter, value, ""),
-    "repr": lambda runtime, value: format_value(runtime.meter, value, ""),
+    "repr": lambda runtime, value: represent_value(runtime.meter, value),
     "format": lambda runtime, value, spec="": format_value(runtime.meter, value, spec),
     "functools.partial": lambda runtime, function, *args, **kwargs: Bound(
         lambda *more, **keywords: runtime.call(function, [*args, *more], kwargs | keywords)
@@ -132,38 +143,54 @@ BUILTINS |= {
     "functools.reduce": lambda runtime, function, values, *initial: functools.reduce(
         lambda x, y: runtime.call(function, [x, y], {}), runtime.items(values), *initial
     ),
-    "itertools.accumulate": lambda runtime, values, function=ADDITION, **initial: Iterator(
-        itertools.accumulate(runtime.items(values), lambda x, y: runtime.call(function, [x, y], {}), **initial)
-    ),
     "operator.itemgetter": lambda runtime, *keys: Bound(
         lambda x: runtime.item(x, keys[0]) if len(keys) == 1 else tuple(runtime.item(x, key) for key in keys)
     ),
     "operator.attrgetter": lambda runtime, name: Bound(lambda x: runtime.attribute(x, name)),
 }
 
+
+def _entries_of_tuples(size: int, count: Callable[[], int]) -> int:
+    """Return the number of entries of `count()` tuples of `size` entries."""
+    if size > MAX_TUPLE_SIZE:
+        raise RefusedError("E-COST", f"itertools: a tuple would have {size} entries, and may have {MAX_TUPLE_SIZE}")
+    if size < 0:
+        raise ValueError("a tuple cannot have a negative number of entries")
+    return count() * max(size, 1)
+
+
+def _entries_of_product(*x: Sequence[Any], repeat: int = 1) -> int:
+    return _entries_of_tuples(len(x) * repeat, lambda: math.prod(map(len, x)) ** repeat)
+
+
+def _entries_of_permutations(x: Sequence[Any], r: int | None = None) -> int:
+    size = len(x) if r is None else r
+    return _entries_of_tuples(size, lambda: math.perm(len(x), size))
+
+
+MAX_TUPLE_SIZE = 20
 LENGTHS: dict[str, Callable[..., int]] = {
     "chain": lambda *x: sum(map(len, x)),
     "pairwise": len,
-    "combinations": lambda x, r: math.comb(len(x), r) * max(r, 1),
-    "combinations_with_replacement": lambda x, r: math.comb(len(x) + r, r) * max(r, 1),
-    "permutations": lambda x, r=None: math.perm(min(len(x), 30), r) * 20,
-    "product": lambda *x, repeat=1: math.prod(map(len, x)) ** operator.index(repeat) * (len(x) * repeat or 1),
+    "combinations": lambda x, r: _entries_of_tuples(r, lambda: math.comb(len(x), r)),
+    "combinations_with_replacement": lambda x, r: _entries_of_tuples(r, lambda: math.comb(len(x) + r, r)),
+    "permutations": _entries_of_permutations,
+    "product": _entries_of_product,
     "islice": lambda x, *ends: len(x),
     "repeat": lambda x, times: max(times, 0),
-    "zip_longest": lambda *x, fillvalue=None: len(x) * max(map(len, x)),
+    "zip_longest": lambda *x, fillvalue=None: len(x) * max(map(len, x), default=0),
 }
-"""At least the lengths of what the functions of itertools return, which are paid for first."""
+"""An upper bound of the number of entries that each function of itertools returns. It is paid before the function runs."""
 
 
 @builtin_variants({f"itertools.{name}": name for name in LENGTHS})
-def combine(name: str, runtime: Runtime, /, *args: Any, **kwargs: Any) -> Iterator:
-    many = len(args) > 20 or any(isinstance(x, int) and x > 20 for x in (*args, *kwargs.values()))
-    if many and name not in ("chain", "islice", "repeat"):
-        raise RefusedError("E-COST", f"itertools.{name} of more than 20 entries at a time")
-    is_number = name == "repeat" and len(args) > 1  # the value that is repeated, and how often
-    plain = [x if is_number or isinstance(x, int) or x is None else list(runtime.items(x)) for x in args]
-    runtime.meter.pay_for_list(LENGTHS[name](*plain, **kwargs))
-    return Iterator(getattr(itertools, name)(*plain, **kwargs))
+def itertools_function(name: str, runtime: Runtime, /, *args: Any, **kwargs: Any) -> Iterator:
+    def is_read(x: Any) -> bool:
+        return name != "repeat" and not isinstance(x, int) and x is not None
+
+    arguments = [list(runtime.items(x)) if is_read(x) else x for x in args]
+    runtime.meter.pay_for_list(LENGTHS[name](*arguments, **kwargs))
+    return Iterator(getattr(itertools, name)(*arguments, **kwargs))
 
 
 @builtin("np.ndindex")
