@@ -108,6 +108,23 @@ def simulator(task: str, algorithm: str, steps: int, episodic: str = "", dense: 
     )
 
 
+def ten_seeds(study: str, task: str, raw: Sequence[str]) -> Comparison:
+    """A task of a sweep of ten seeds and 30,000 steps, and its candidates for the best decoder of raw features."""
+
+    def runs(method: str) -> Directories:
+        return [f"sweeps/{study}/{task}/{method}-td3"]
+
+    return Comparison(
+        30_000,
+        runs("episodic"),
+        runs("dense"),
+        {method: runs(method) for method in raw},
+        [f"sweeps/{study}/{task}/lare-rrdu-td3-draw0"],
+        [f"sweeps/{study}/{task}/lare-bayes-td3-draw0"],
+        runs("bayes"),
+    )
+
+
 HALF_CHEETAH, WALKER, REACHER = "HalfCheetah-v4", "Walker2d-v4", "Reacher-v4"
 TEN_SEEDS = "scores/cheetah/HalfCheetah-v4,paidonce"
 THRESHOLD = "scores/threshold/HalfCheetahThreshold-v4"
@@ -126,6 +143,7 @@ COMPARISONS = {
         [f"{TEN_SEEDS}/lare-bayes"],
         [f"{TEN_SEEDS}/bayes"],
     ),
+    f"{REACHER}, TD3": ten_seeds("headline", REACHER, ("rrdu",)),
     "HalfCheetahThreshold-v4, TD3": Comparison(
         60_000,
         [f"{THRESHOLD}/episodic"],
@@ -151,15 +169,6 @@ COMPARISONS = {
         [f"{SWEEP}/{HALF_CHEETAH}/lare-bayes-td3-draw0", f"{GPU}/{HALF_CHEETAH}/lare-bayes"],
         [f"{GPU}/{HALF_CHEETAH}/bayes"],
         in_mean=False,
-    ),
-    f"{REACHER}, TD3": Comparison(
-        100_000,
-        [f"{SWEEP}/{REACHER}/episodic-td3"],
-        [f"{LEARNING}/{REACHER}/dense"],
-        {"rrdu": [f"{LEARNING}/{REACHER}/rrdu"], "rd": [f"{SWEEP}/{REACHER}/rd-td3"]},
-        [f"{LEARNING}/{REACHER}/lare-rrdu"],
-        [f"{SWEEP}/{REACHER}/lare-bayes-td3-draw0", f"{GPU}/{REACHER}/lare-bayes"],
-        [f"{GPU}/{REACHER}/bayes"],
     ),
     f"{WALKER}, TD3": Comparison(
         50_000,

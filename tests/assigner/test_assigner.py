@@ -95,6 +95,7 @@ def test_rewards_of_every_method(method, function):
     assert (metrics["credit/fits"] > 0) == np.isfinite(metrics["credit/loss"]) == METHODS[method].uses_gradient
 
 
+@pytest.mark.long
 def test_must_learn_the_reward_from_factors_that_contain_it(phi):
     """R^2 needs eight predicted returns, and does not depend on how often it is asked."""
     credit, silent = small_assigner("lare-linear", phi), small_assigner("lare-linear", phi)

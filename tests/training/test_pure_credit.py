@@ -67,6 +67,7 @@ def test_phi_reads_actions_in_the_units_of_the_environment(reward):
     np.testing.assert_allclose(np.ravel(r_hat), np.ravel(expected), rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.long
 def test_invalid_factors_are_counted_and_not_used(phi):
     """A step is invalid where the observation is NaN. `lare-rrdu` reads factors alone. Phi is part of the program."""
     credit = pure_credit("lare-rrdu", phi, **SUM, fit_updates=2)

@@ -1,9 +1,11 @@
 import numpy as np
+import pytest
 
 from paper import regret
 from paper.exhibits import budgets
 
 
+@pytest.mark.long
 def test_the_page(monkeypatch):
     monkeypatch.setattr(regret, "REDUNDANT", (1, 6))
     page = regret.make_page(budgets()["smoke"], "lare-rl reproduce theory")
