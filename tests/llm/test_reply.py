@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import textwrap
 
 import pytest
 from hypothesis import given, settings
@@ -56,6 +57,10 @@ def test_malformed_reply(text, words):
         (f"A draft: {json.dumps(GOOD)}, or better: {json.dumps(WITH_CODE)}", "u"),
         (f'First {{"Functions": "draft"}}, then {json.dumps(WITH_CODE)}, {{"Functions": "x"}}', "u"),
         ("{}" * 150 + json.dumps(WITH_CODE), "u"),
+        (f"[{json.dumps(WITH_CODE)}]", "u"),
+        (f"{json.dumps(WITH_CODE)}</think>", "u"),
+        (f"It is\n```python title=phi.py\n{CODE}", "It is\n"),
+        (f"1. It is\n   ```\n{textwrap.indent(CODE, '   ')}\n   ```", "1. It is\n   "),
     ],
 )
 def test_reply_among_other_words(text, understand):
@@ -66,6 +71,14 @@ def test_reply_among_other_words(text, understand):
 def test_fence_in_a_docstring():
     source = 'def evaluation_func(observation, action):\n    """Scores.\n    ```\n    x = 1\n    ```\n    """\n    return [action]'
     assert parse_reply(json.dumps(GOOD | {"Functions": source})).functions == source
+
+
+def test_functions_of_several_fences():
+    helper = "def double(x):\n    return 2 * x"
+    text = f"A draft:\n```\n{CODE}\n```\nBetter:\n```\n{helper}\n```\n```\n{CODE.replace('[action]', '[double(action)]')}\n```"
+    names = {}
+    exec(parse_reply(text).functions, names)
+    assert names["evaluation_func"](0, 3) == [6]
 
 
 def test_fence_with_the_function_is_chosen():

@@ -21,6 +21,8 @@ def events(body, tool="test", arguments=None, result="3 failed, 25 passed in 1.5
         ("len(result.split())", 6.0),
         ("find_numbers(result)[0]", 3.0),
         ("sum(find_numbers('-1.5, +2, v3, 4.25.6 7s'))", 11.75),
+        ("sum(find_numbers('loss 1e-3, 2.5E2 of 3e 1e400'[:-6] + ' .5'))", 253.501),
+        ("find_numbers('1e400')[0] / 1e300", 1.0),
         ("min(float(find_numbers(result)[1]), 20)", 20.0),
         ("text.lower().count('t')", 3.0),
         ("any(word.isdigit() for word in result.split())", 1.0),

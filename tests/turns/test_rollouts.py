@@ -139,14 +139,14 @@ BAD = [
     ({**OUTCOME, "turns": [3]}, ["turns[0]", "3"]),
     ({**OUTCOME, "turns": [{"a": "b"}]}, ["turns[0]", "'a'", "'b'"]),
     ({**OUTCOME, "turns": [{"a": float("inf")}]}, ["turns[0]", "'a'", "inf"]),
-    ({**OUTCOME, "turns": [{"a\nb": 1}]}, ["turns[0]", "one line"]),
+    ({**OUTCOME, "turns": [{"a\nb": 1}]}, ["turns[0]", "line breaks"]),
     ({**OUTCOME, "turns": [{}], "group": [1]}, ["group", "[1]"]),
     ({**OUTCOME, "turns": [{}], "truncated": "no"}, ["truncated", "'no'"]),
     ({**OUTCOME, "messages": [3]}, ["messages[0]", "role"]),
-    ({**OUTCOME, "messages": [{"role": "user", "content": "hi"}]}, ["no turn", "assistant"]),
+    ({**OUTCOME, "messages": [{"role": "user", "content": "hi"}]}, ["no message", "assistant"]),
     ({**OUTCOME, "messages": [{"role": "assistant", "content": 3}]}, ["messages[0]", "content", "3"]),
     ({**OUTCOME, "messages": [{"role": "assistant", "tool_calls": [{}]}]}, ["tool_calls[0]", "name"]),
-    ({**OUTCOME, "messages": MESSAGES, "turns": [{}]}, ["3 messages of the assistant", "1 turn"]),
+    ({**OUTCOME, "messages": MESSAGES, "turns": [{}]}, ["3 messages of the assistant", "turns has 1"]),
 ]
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import textwrap
 from typing import Any
 
 from pydantic import ConfigDict, Field
@@ -14,7 +15,7 @@ __all__ = ["REPLY_KEYS", "MalformedReplyError", "Reply", "parse_reply"]
 
 _MAX_CHARACTERS = 200_000
 _MAX_STARTS = 100
-"""The most positions of a text that are tried as the beginning of an object."""
+"""How many positions of a text are tried as the start of an object, at most."""
 
 
 class MalformedReplyError(LareError):
@@ -29,13 +30,14 @@ class Reply(CheckedModel):
     understand: str = Field(alias="Understand")
     analyze: str = Field(alias="Analyze")
     functions: str = Field(alias="Functions", min_length=1)
-    """Source of `evaluation_func(observation, action)`."""
+    """Source of `evaluation_func(observation, action)`, without fences and without the API key."""
 
 
 REPLY_KEYS = [str(field.alias) for field in Reply.model_fields.values()]
-_FUNCTIONS = REPLY_KEYS[-1]
+_FUNCTIONS_KEY = REPLY_KEYS[-1]
 
-_FENCED_BLOCK = re.compile(r"```[ \t]*+([\w.+-]*+)[ \t]*+\r?\n(.*?)```", re.DOTALL)
+# A reply that was cut off may lack the end of its last fence.
+_FENCED_BLOCK = re.compile(r"```[^\n`]*+\n(?P<code>.*?)(?:```|\Z)", re.DOTALL)
 # Some models write their reasoning first, which may contain drafts of the answer.
 _REASONING_END = re.compile(r"</think(?:ing)?>")
 _OBJECT_START = re.compile(r'\{\s*"')
@@ -56,16 +58,19 @@ def parse_reply(text: str) -> Reply:
     except ValueError as error:
         values = _find_object(text)
         if values is None:
-            raise MalformedReplyError(f"the reply is not one JSON object: {error}") from error
+            reason = f": {error}" if "{" in text else ", and has no fenced function"
+            raise MalformedReplyError(f"the reply is not one JSON object{reason}") from error
     if not isinstance(values, dict):
-        raise MalformedReplyError(f"the reply is JSON, but not an object: {text.strip()[:40]!r}")
+        values = _find_object(text)
+        if values is None:
+            raise MalformedReplyError(f"the reply is JSON, but not an object: {text.strip()[:40]!r}")
     try:
         reply = Reply(**values)
     except LareError as error:
         raise MalformedReplyError(f"the reply's JSON object does not have the requested form: {error}") from error
     fences = list(_FENCED_BLOCK.finditer(reply.functions))
-    fences = [fence for fence in fences if "def " in fence[2]] or fences  # others show what to import, or an example
-    functions = reply.functions if not fences or "def " in reply.functions[: fences[0].start()] else fences[0][2]
+    is_fenced = fences and "def " not in reply.functions[: fences[0].start()]
+    functions = _join_functions(fences) if is_fenced else reply.functions
     texts = {"understand": reply.understand, "analyze": reply.analyze, "functions": functions}
     for value in texts.values():
         _check_characters(value)
@@ -82,11 +87,23 @@ def _check_characters(text: str) -> None:
         ) from None
 
 
+def _join_functions(fences: list[re.Match[str]]) -> str:
+    """Return the code of fences with functions. If a function is defined twice, the last definition counts."""
+    codes = [textwrap.dedent(fence["code"]) for fence in fences]
+    return "\n\n".join([code for code in codes if "def " in code] or codes)  # others show what to import, or an example
+
+
 def _find_object(text: str) -> dict[str, Any] | None:
-    """Return the last complete object that ends after the reasoning, or else the function in such a fenced block."""
+    """Return the object that `_find_object_after` finds after the reasoning, or else in the whole text."""
+    reasoning_end = max((match.end() for match in _REASONING_END.finditer(text)), default=0)
+    values = _find_object_after(text, reasoning_end)
+    return _find_object_after(text, 0) if values is None and reasoning_end else values
+
+
+def _find_object_after(text: str, reasoning_end: int) -> dict[str, Any] | None:
+    """Return the last object with all keys, or else with `Functions`, or else the fenced functions as such an object."""
     decoder = json.JSONDecoder(strict=False, parse_int=parse_integer)
     incomplete = None
-    reasoning_end = max((match.end() for match in _REASONING_END.finditer(text)), default=0)
     starts = [match.start() for match in _OBJECT_START.finditer(text)]
     for start in reversed(starts[-_MAX_STARTS:]):
         try:
@@ -98,11 +115,9 @@ def _find_object(text: str) -> dict[str, Any] | None:
             continue
         if value.keys() >= set(REPLY_KEYS):
             return value
-        if _FUNCTIONS in value:
-            incomplete = value
-    if incomplete is not None:
+        if _FUNCTIONS_KEY in value:
+            incomplete = incomplete or value
+    fences = [fence for fence in _FENCED_BLOCK.finditer(text, reasoning_end) if "def " in fence["code"]]
+    if incomplete is not None or not fences:
         return incomplete
-    for fence in _FENCED_BLOCK.finditer(text):
-        if fence.end() > reasoning_end and "def " in fence[2]:
-            return dict(zip(REPLY_KEYS, (text[reasoning_end : fence.start()], "", fence[2]), strict=True))
-    return None
+    return dict(zip(REPLY_KEYS, (text[reasoning_end : fences[0].start()], "", _join_functions(fences)), strict=True))

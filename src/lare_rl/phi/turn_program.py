@@ -3,9 +3,9 @@
     def turn_events(tool, arguments, result, text):
         return {"tests pass": tool == "test" and "passed" in result.lower()}
 
-The language is that of `read.py`, without arrays and with `find_numbers(text)`, which returns the numbers in a text. `tool`,
-`result` and `text` are texts, and `arguments` is a dictionary. The program is carried out anew for each call, so that it can
-keep nothing.
+The language is that of `read.py`, with `find_numbers(text)`, which returns the numbers in a text. NumPy may be used, but events are
+plain numbers. `tool`, `result` and `text` are texts, and `arguments` is a dictionary. The program starts from nothing for each call of a
+tool, so it cannot remember earlier ones.
 """
 
 import ast
@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from lare_rl.errors import short_repr
 from lare_rl.phi.builder import Builder, building
 from lare_rl.phi.interpreter import Interpreter
 from lare_rl.phi.limits import MAX_FACTORS, MAX_INT_BITS, MAX_TEXT_LENGTH, RefusedError
@@ -29,22 +30,27 @@ TURN_FUNCTION_NAME = "turn_events"
 """The name of the function that a program must define."""
 MAX_STEPS = 150_000  # for one call; a method of a text takes a step for each of its characters
 MAX_NAME_LENGTH = 60  # of an event
-MAX_EVENT = 1e6  # the largest number of an event
+MAX_EVENT_VALUE = 1e6
 MAX_ARGUMENTS = 100  # entries of the arguments, and of each list or dictionary within them
 MAX_ARGUMENT_DEPTH = 4
-MAX_NUMBERS = 1000  # that find_numbers returns
-MAX_NUMBER = 1e300  # in the arguments; larger ones become this one
+MAX_FOUND_NUMBERS = 1000
+MAX_NUMBER = 1e300  # in texts and arguments; larger ones become this one
 OMISSION = "\n... (the middle of a long text is left out) ...\n"
-NUMBER = re.compile(r"(?<![\w.])[-+]?\d{1,300}(?:\.\d{1,300})?(?!\d)")
+NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d{1,300}(?:\.\d{1,300})?|\.\d{1,300})(?:[eE][-+]?\d{1,3})?(?!\d)")
 
 
 @dataclass(frozen=True)
 class TurnProgram:
+    """A parsed program. It runs only when it reads a turn."""
+
     source: str
     tree: ast.Module
 
     def events(self, tool: str, arguments: Mapping[str, Any], result: str, text: str) -> dict[str, float]:
         """Return the events of one call: names and numbers.
+
+        The program sees texts of more than `MAX_TEXT_LENGTH` characters without their middle, at most `MAX_ARGUMENTS` entries of a list
+        or a dictionary, and "..." for what is nested deeper than `MAX_ARGUMENT_DEPTH`.
 
         Args:
             tool: the name of the tool; empty if none was called.
@@ -72,10 +78,10 @@ class TurnProgram:
 
 
 def read_turn_program(source: str) -> TurnProgram:
-    """Parse a program. What it does is known only when it reads turns.
+    """Parse a program. Other errors appear when it reads turns.
 
     Raises:
-        RefusedError: the text is not Python, or too long.
+        RefusedError: the text is not Python, too long or nested too deep, or has invisible characters.
     """
     try:
         return TurnProgram(source, parse(source))
@@ -98,9 +104,9 @@ def _copy_argument(value: Any, depth: int = 0) -> Any:
     if isinstance(value, bool) or value is None:
         return value
     if isinstance(value, int):
-        return value if value.bit_length() <= MAX_INT_BITS else MAX_NUMBER if value > 0 else -MAX_NUMBER
+        return value if value.bit_length() <= MAX_INT_BITS else _bound(value)
     if isinstance(value, float):
-        return min(max(value, -MAX_NUMBER), MAX_NUMBER) if not math.isnan(value) else 0.0
+        return _bound(value) if not math.isnan(value) else 0.0
     if depth == MAX_ARGUMENT_DEPTH:
         return "..."
     if isinstance(value, Mapping):
@@ -111,12 +117,16 @@ def _copy_argument(value: Any, depth: int = 0) -> Any:
     return "..."
 
 
+def _bound(number: float) -> float:
+    return float(min(max(number, -MAX_NUMBER), MAX_NUMBER))
+
+
 def _find_numbers(meter: Meter, text: Any) -> list[float]:
-    """Return the numbers in a text, in their order: 3, -1.5, +7, and the 20 of 20%; but not the 3 of v3."""
+    """Return the numbers in a text, in their order: 3, -1.5, 2e-3, and the 20 of 20%; but not the 3 of v3. A comma is between numbers."""
     if not isinstance(text, str):
         raise TypeError(f"find_numbers takes a text, not {describe(text)}")
     meter.pay(len(text))
-    numbers = [float(match[0]) for match in NUMBER.finditer(text)][:MAX_NUMBERS]
+    numbers = [_bound(float(match[0])) for match in NUMBER.finditer(text)][:MAX_FOUND_NUMBERS]
     return meter.pay_for_list(numbers)
 
 
@@ -128,11 +138,12 @@ def _check_events(events: Any) -> dict[str, float]:
     result = {}
     for name, value in events.items():
         if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME_LENGTH or name != one_line(name):
-            text = f"the name of an event must be a text of 1 to {MAX_NAME_LENGTH} characters, in one line"
-            raise RefusedError("E-FORM", text)
+            rule = f"a text of 1 to {MAX_NAME_LENGTH} visible characters, without line breaks, and spaces only between words"
+            raise RefusedError("E-FORM", f"the name of an event must be {rule}, and is {short_repr(name)}")
         if not isinstance(value, bool | int | float):
             raise RefusedError("E-FORM", f"the event {name!r} must be a number or a truth value, not {describe(value)}")
-        if not abs(value) <= MAX_EVENT:
-            raise RefusedError("E-FORM", f"the event {name!r} must be a number of at most {MAX_EVENT:g}")
+        if not abs(value) <= MAX_EVENT_VALUE:
+            limits = f"between -{MAX_EVENT_VALUE:g} and {MAX_EVENT_VALUE:g}"
+            raise RefusedError("E-FORM", f"the event {name!r} must be {limits}, and is {value:g}")
         result[name] = float(value)
     return result

@@ -47,6 +47,7 @@ class Rollout:
     """The features of each turn."""
     outcome: float
     group: str
+    """Empty without a group. A whole number becomes a text, so 1 and "1" are one group."""
     truncated: bool = False
 
 
@@ -54,7 +55,7 @@ def read_rollouts(rollouts: Any, phi: Phi | None = None) -> list[Rollout]:
     """Check rollouts and return them.
 
     Raises:
-        LareError: a rollout is malformed, or `phi` fails. The message names the rollout, starting with rollout 0.
+        LareError: a rollout is malformed, or `phi` fails. The message names the rollout by its index, from 0.
     """
     if isinstance(rollouts, Mapping | str | bytes) or not isinstance(rollouts, Iterable):
         raise LareError(f"rollouts must be a list of mappings, and not {short_repr(rollouts)}")
@@ -70,10 +71,10 @@ def read_rollout(rollout: Any, where: str, phi: Phi | None = None) -> Rollout:
     if not isinstance(rollout, Mapping):
         raise LareError(f"{where} must be a mapping with outcome and messages or turns, and is {short_repr(rollout)}")
     outcome = _read_number(rollout.get("outcome"), f"{where}: outcome")
-    group = rollout.get("group", "")
+    group = "" if rollout.get("group") is None else rollout["group"]
     if not isinstance(group, str | int | np.integer) or isinstance(group, bool):
         raise LareError(f"{where}: group must be a text or a whole number, and is {short_repr(group)}")
-    truncated = rollout.get("truncated", False)
+    truncated = False if rollout.get("truncated") is None else rollout["truncated"]
     if not isinstance(truncated, bool | np.bool_):
         raise LareError(f"{where}: truncated must be true or false, and is {short_repr(truncated)}")
     features = _read_features(rollout.get("messages"), rollout.get("turns"), where, phi)
@@ -96,13 +97,15 @@ def _read_features(messages: Any, turn_numbers: Any, where: str, phi: Phi | None
         return rows
     turns = split_turns(messages, where)
     if not turns:
-        raise LareError(f"{where} has no turn: the assistant says nothing")
+        raise LareError(f"{where} has no message with the role assistant")
+    if len(turns) > MAX_TURNS:
+        raise LareError(f"{where} has {len(turns)} turns, and may have {MAX_TURNS}")
     if rows is None:
         rows = [{}] * len(turns)
     if len(rows) != len(turns):
         raise LareError(
-            f"{where} has {len(turns)} messages of the assistant, but numbers of {len(rows)} turns: one entry of "
-            "turns is needed for each message of the assistant"
+            f"{where} has {len(turns)} messages of the assistant, but turns has {len(rows)} of them: give one entry for each "
+            "message of the assistant"
         )
     events = [{}] * len(turns) if phi is None else _evaluate(phi, turns, where)
     return [old | event | new for old, event, new in zip(message_features(turns), events, rows, strict=True)]
@@ -130,7 +133,8 @@ def _read_row(row: Any, what: str, where: str) -> Row:
     for name, value in row.items():
         if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or name != one_line(name):
             raise LareError(
-                f"{where}: {what} has the name {short_repr(name)}: a text of 1 to {MAX_NAME} characters in one line is needed"
+                f"{where}: {what} has the name {short_repr(name)}: a name is a text of 1 to {MAX_NAME} visible characters, without line "
+                "breaks, and spaces only between words"
             )
         numbers[name] = _read_number(value, f"{where}: {name!r} in {what}")
     return numbers
