@@ -2,6 +2,7 @@
 
 import difflib
 import operator
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from inspect import cleandoc, isclass
@@ -27,6 +28,7 @@ __all__ = [
     "short_repr",
 ]
 
+_UNION_TAG = re.compile(r"constrained-|function-|literal\[")
 MAX_REPR = 100
 """Characters of a value that a message quotes."""
 
@@ -171,8 +173,8 @@ def _describe(error: ValidationError, keys: Sequence[str]) -> str:
 
 
 def _path(problem: Mapping[str, Any]) -> str:
-    """Return the key of a problem, such as `td3.gamma`."""
-    return ".".join(map(str, problem["loc"]))
+    """Return the key of a problem, such as `td3.gamma`, without the names that Pydantic gives to the alternatives of a union."""
+    return ".".join(str(part) for part in problem["loc"] if not _UNION_TAG.match(str(part)))
 
 
 def _describe_problem(problem: Mapping[str, Any], keys: Sequence[str]) -> str:

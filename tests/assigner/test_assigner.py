@@ -2,7 +2,6 @@
 
 import re
 import threading
-from dataclasses import fields
 
 import gymnasium
 import jax
@@ -28,7 +27,7 @@ from lare_rl.credit import decoder_state
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
-from lare_rl.latent.function import LatentFunction
+from lare_rl.latent.function import verify_function
 
 METHODS_FOR_STEPS = [m for m in METHODS.values() if m.has_proxy_rewards and not m.decoder_kind.whole_episodes]
 SINGLE_AGENT_KINDS = {"rrdu", "diaster", "lare-bayes", "lare-signs", "ircr", "llm-reward"}
@@ -262,26 +261,28 @@ def test_many_steps_at_once_are_learned_in_chunks():
     np.testing.assert_allclose(chunked.rewards_at(np.arange(10_000)), r_hat, atol=0.1 * r_hat.std())
 
 
-class FailingPhi(LatentFunction):
-    """A function that fails as long as `fails` is true."""
-
-    fails = True
-
-    def step_factors(self, *args):
-        if self.fails:
-            raise LareError("phi has failed")
-        return super().step_factors(*args)
-
-
-def test_failing_phi_loses_no_steps(phi, monkeypatch):
-    failing = FailingPhi(**{field.name: getattr(phi, field.name) for field in fields(phi)})
-    credit, (episode,) = small_assigner("lare-rd", failing), random_episodes([4])
-    numbers = credit.add_episode(*episode)
-    with pytest.raises(LareError, match="phi has failed"):
-        credit.rewards_at(numbers)
-    monkeypatch.setattr(FailingPhi, "fails", False)
-    assert credit.rewards_at(numbers).shape == (4,)
-    np.testing.assert_array_equal(credit.store.inputs[numbers], phi.step_factors(*episode[:3], "before"))
+def test_step_with_an_infinite_factor_costs_only_the_episodes_that_wait(chase, tmp_path):
+    first, second, third = random_episodes([4, 5, 6])
+    second[0][2] = second[2][1] = 1e7
+    phi = verify_function(
+        "def evaluation_func(o, a):\n    return [o[:, :1] + np.exp(np.maximum(o[:, 1:] - 1e6, 0))]", chase
+    )
+    credit = small_assigner("lare-linear", phi)
+    credit.add_episode(*(np.minimum(array, 0) for array in first))
+    credit.fit()
+    bad = credit.add_episode(*second)
+    credit.add([[0.0, 0.0]], [[0.0]], [[0.0, 0.0]], [0.0], [False], [False])
+    with pytest.raises(LareError, match=r"factor_1. is inf"):
+        credit.rewards_at(bad)
+    np.testing.assert_array_equal(credit.store.inputs[bad], 0)
+    numbers = credit.add_episode(*(np.minimum(array, 0) for array in third))
+    credit.fit()
+    assert np.isfinite(credit.rewards_at(numbers)).all()
+    assert credit.metrics()["credit/dropped"] == 2
+    assert credit.metrics()["credit/episodes"] == 3
+    assert [len(episode.step_ids) for episode in credit.store.episodes.values()] == [4, 6]
+    credit.save(tmp_path / "credit")
+    assert list(CreditAssigner.load(tmp_path / "credit").store.episodes) == [0, 2]
 
 
 def test_several_threads_may_use_an_assigner():

@@ -314,6 +314,7 @@ def learn_with_callback(env, credit):
         (lambda: off_policy(make_env(), make_assigner(capacity=99)), "capacity=300"),
         (lambda: learn_with_callback(make_env(), make_assigner(capacity=31)), "capacity=32"),
         (lambda: off_policy(make_env(), 5), "CreditAssigner, and is 5"),
+        (lambda: off_policy(make_env(), make_assigner(action_space=Discrete(1))), "another action_space"),
         (lambda: off_policy(make_env(), make_assigner(action_space=3)), "actions .* 1 numbers.* 3"),
         (lambda: off_policy(make_env(), make_assigner("rd", agents=2, max_steps=20)), "agents=2.* has 1"),
         (

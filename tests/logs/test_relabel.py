@@ -20,7 +20,7 @@ from helpers.toy_logs import PHI, logged_episodes, read_directory
 from lare_rl import LareError
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.logs import log as log_module
-from lare_rl.logs.relabel import MESSAGES, Relabelled, hold_out_flags, predicted_return_statistics
+from lare_rl.logs.relabel import MESSAGES, Relabelled, _r2_within_groups, hold_out_flags, predicted_return_statistics
 from lare_rl.tasks.spec import PaidSteps
 from lare_rl.util.findings import render
 
@@ -230,7 +230,7 @@ def test_predicted_return_statistics():
         ({"return_r2": math.nan}, ["correlation"]),
         ({"return_r2": 0.09}, ["r2", "worthless"]),
         # The groups explain the returns, and the steps nothing.
-        ({"group_r2": 0.05}, ["r2", "within_groups", "worthless"]),
+        ({"group_r2": 0.05}, ["r2", "within_groups", "worthless_within_groups"]),
         ({"cut": 3}, ["cut", "r2"]),
     ],
 )
@@ -362,5 +362,14 @@ def test_groups_of_the_task_and_the_log_agree(tmp_path):
         relabel(episodes, tmp_path / "new", task=task)
     for number, episode in enumerate(episodes):
         episode |= {"group": "easy"} if number != 4 else {}
-    with pytest.raises(LareError, match="episode 4 has no group"):
-        relabel(episodes, tmp_path / "new", settings=SUM, hold_out=0.0)
+    for hold_out in (0.0, 0.9):  # with the latter, it is held out
+        with pytest.raises(LareError, match="episode 4 has no group"):
+            relabel(episodes, tmp_path / "new", settings=SUM, hold_out=hold_out)
+
+
+def test_r2_within_groups_of_equal_returns():
+    """The rounding of a group's mean is no difference."""
+    groups = ["easy"] * 6 + ["hard"] * 6
+    assert np.isnan(_r2_within_groups([0.1] * 6 + [0.7] * 6, [0.2, 0.3] * 6, groups))
+    r2 = _r2_within_groups([0.1, 0.2] * 3 + [0.7, 0.9] * 3, [0.1, 0.2] * 3 + [0.7, 0.8] * 3, groups)
+    assert r2 == pytest.approx(0.8)

@@ -46,8 +46,10 @@ def test_mlflow_gets_every_number(dense_run, tmp_path, monkeypatch):
 def test_failing_service_is_a_warning(dense_run, tmp_path, monkeypatch):
     monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
     listener = MLflow("toys", (tmp_path / "mlruns").as_uri())
-    lines = dense_run.metrics()[:2]
+    lines = [line | {"evaluation/a[0]": 1.0} for line in dense_run.metrics()[:2]]
     listener.on_start("Chase dense", 0, 240)
+    listener.on_evaluation(lines[:1])
+    assert "evaluation/a_0_" in listener.client.get_run(listener.runs[0]).data.metrics
     monkeypatch.setattr(listener, "metric", "no class")
     with pytest.warns(RuntimeWarning, match=r"MLflow .*not callable.*metrics\.jsonl"):
         listener.on_evaluation(lines)
@@ -55,6 +57,7 @@ def test_failing_service_is_a_warning(dense_run, tmp_path, monkeypatch):
     listener.on_evaluation(lines)  # without another warning
     listener.on_stop()
     assert len(listener.runs) == n_runs
+    assert {listener.client.get_run(run).info.status for run in listener.runs.values()} == {"FINISHED"}
     listener.on_start("Chase dense", 0, 240)  # another training tries again
     with pytest.warns(RuntimeWarning):
         listener.on_evaluation(lines)

@@ -26,6 +26,7 @@ from lare_rl.credit import closed_form, learning, prequential
 from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.methods import Fit
+from lare_rl.errors import LareError
 from lare_rl.util.float64 import float64
 from lare_rl.util.rows import pad_rows, padded_size
 
@@ -36,7 +37,7 @@ MAX_PENDING_STEPS = 256
 CHUNK_UPDATES = 16
 """Gradient updates of a decoder in one call."""
 MAX_FIRST_UPDATES = 256
-"""The most gradient updates that may wait for the first episode. This limits the burst of updates after a long one."""
+"""The most gradient updates that may wait before the first one, or while no episode is stored. This limits the burst that follows."""
 PHI_SAMPLE_STEPS = 256
 """About how many steps `phi` is verified on, after it is loaded from a file."""
 
@@ -79,7 +80,7 @@ class DecoderLearner:
     def add_steps(
         self, observation: np.ndarray, action: np.ndarray, next_observation: np.ndarray, alive: np.ndarray | None
     ) -> Int[np.ndarray, " steps"]:
-        """Store new steps, and return their numbers. Raises `LareError` if they are more than the capacity."""
+        """Store new steps, and return their numbers. Raises `LareError` if they are more than the capacity, or like `flush_inputs`."""
         n_steps = len(observation)
         oldest = self.store.n_added + n_steps - self.store.capacity
         if any(episode.step_ids[0] < oldest for episode in chain.from_iterable(self._pending_episodes)):
@@ -88,7 +89,7 @@ class DecoderLearner:
         self._pending_steps.append((step_ids, observation, action, next_observation))
         self.n_pending_steps += n_steps
         self._pending_updates += self.config.fits_per_step * n_steps
-        if not self.n_updates:
+        if not (self.n_updates and self.store.episodes):
             self._pending_updates = min(self._pending_updates, MAX_FIRST_UPDATES)
         return step_ids
 
@@ -109,12 +110,22 @@ class DecoderLearner:
             self.learn_returns()
 
     def flush_inputs(self) -> None:
-        """Compute the decoder's inputs of pending steps, with phi. Raises `LareError` if a factor is not finite."""
+        """Compute the decoder's inputs of pending steps, with phi.
+
+        Raises `LareError` if a factor is not finite. The episodes of all pending steps are then abandoned.
+        """
         if not self._pending_steps:
             return
         step_ids, *steps = (np.concatenate(arrays) for arrays in zip(*self._pending_steps, strict=True))
-        # Nothing changes before phi has been called for all steps, because phi may raise an error.
-        chunks = [self.config.compute_inputs(*(rows[chunk] for rows in steps)) for chunk in call_chunks(len(step_ids))]
+        self._pending_steps.clear()
+        self.n_pending_steps = 0
+        try:
+            chunks = [
+                self.config.compute_inputs(*(rows[chunk] for rows in steps)) for chunk in call_chunks(len(step_ids))
+            ]
+        except LareError:
+            self._forget_since(int(step_ids[0]))
+            raise
         inputs, rows = np.concatenate(chunks), step_ids % self.store.capacity
         self.store.inputs[rows, ..., : inputs.shape[-1]] = inputs
         if self.config.spec.basis.n_tracked:
@@ -125,10 +136,15 @@ class DecoderLearner:
         if self.config.phi is not None and sum(len(action) for _, action in self.phi_sample) < PHI_SAMPLE_STEPS:
             sample = [array.reshape(-1, array.shape[-1])[:PHI_SAMPLE_STEPS].copy() for array in steps]
             self.phi_sample.append((sample[2], sample[1]))
-        self._pending_steps.clear()
-        self.n_pending_steps = 0
         if sum(len(inputs) for inputs, _ in self._pending_inputs) >= MAX_PENDING_STEPS:
             self.flush_statistics()
+
+    def _forget_since(self, step_id: int) -> None:
+        """Abandon the episodes with this step or later ones, which are all pending."""
+        forgotten = set(map(id, self.store.forget_since(step_id)))
+        kept = [[episode for episode in batch if id(episode) not in forgotten] for batch in self._pending_episodes]
+        self._pending_episodes = deque(filter(None, kept))
+        self._pending_returns = [episode for episode in self._pending_returns if id(episode) not in forgotten]
 
     def _fill_history(self, rows: Int[np.ndarray, " n"]) -> None:
         """Compute the history of steps in their order. Their other inputs are stored, and all inputs of earlier steps."""
@@ -173,25 +189,23 @@ class DecoderLearner:
     def learn_returns(self) -> None:
         """Let the decoder learn from pending episodes.
 
-        If they are many, a decoder in closed form is fitted several times, so that every return is predicted before the decoder is
-        fitted to it. How many fits these are depends on when this is called.
+        Every return is predicted before the decoder is fitted to it. If the episodes are many, a decoder in closed form is fitted several
+        times in between, so that later ones are predicted by a decoder that has seen the earlier ones.
         """
         self.flush_inputs()
         self.flush_statistics()
-        oldest = self.store.oldest_step
-        stored = [[episode for episode in batch if episode.step_ids[0] >= oldest] for batch in self._pending_episodes]
-        pending = self._pending_episodes = deque(filter(None, stored))
+        pending = self._pending_episodes
         with on_cpu(), float64():
             while pending:
                 new = pending.popleft()
-                while pending and len(new) < self._episodes_until_fit():
+                while pending and len(new) < self._max_batch():
                     new += pending.popleft()
                 self.n_learned += len(new)
                 if self.config.method.fit is not None:
                     self.decoder = jax.block_until_ready(self._learn(self.decoder, new))
 
-    def _episodes_until_fit(self) -> float:
-        """Return the number of new episodes until the next fit in closed form. Other decoders are not fitted here."""
+    def _max_batch(self) -> float:
+        """Return how many episodes a decoder in closed form predicts before it may be fitted again. Other decoders are not fitted here."""
         return (closed_form.FIT_GROWTH - 1) * self.n_learned if self.config.spec.has_closed_form else inf
 
     def _learn(self, decoder: DecoderState, new: Sequence[StoredEpisode]) -> DecoderState:
@@ -207,8 +221,8 @@ class DecoderLearner:
         may_rebuild = are_all_stored or (self.config.forget and self.store.oldest_step > 0)
         if self.config.method.fit is not Fit.SIGNS and may_rebuild and compiled.is_stale(closed, decoder.statistics):
             closed = compiled.reset_statistics(closed, decoder.statistics)
-            pending = set(map(id, chain.from_iterable(self._pending_episodes)))
-            earlier = [episode for episode in self.store.episodes.values() if id(episode) not in pending]
+            n_pending = sum(map(len, self._pending_episodes))  # the last ones that were stored
+            earlier = list(self.store.episodes.values())[: len(self.store.episodes) - n_pending]
             for batch in whole_episodes(self.store, self.config.spec, earlier):
                 closed = compiled.add_to_sums(closed, batch)
             decoder = decoder._replace(closed_form=closed)

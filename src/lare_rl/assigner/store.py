@@ -281,6 +281,20 @@ class Store:
         """Abandon the running episode of an environment. Its steps stay stored, and are never learned from."""
         self.dropped += self.running.pop(env_id, None) is not None
 
+    def forget_since(self, step_id: int) -> list[StoredEpisode]:
+        """Abandon the episodes that have this step or later ones. Return those of them that had ended."""
+        for env_id in [key for key, episode in self.running.items() if episode.step_ids[-1] >= step_id]:
+            self.drop(env_id)
+        numbers = [number for number, episode in self.episodes.items() if episode.step_ids[-1] >= step_id]
+        self.dropped += len(numbers)
+        forgotten = [self.episodes.pop(number) for number in numbers]
+        self.oldest = [entry for entry in self.oldest if entry[1] in self.episodes]
+        heapq.heapify(self.oldest)
+        rows = np.arange(step_id, self.n_added) % self.capacity
+        self.inputs[rows] = self.length[rows] = 0
+        self.episode[rows] = -1
+        return forgotten
+
     def rows(self, step_ids: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
         """Return the rows of stored steps. Raises `LareError` if a step was never stored, or is not stored any more."""
         missing = step_ids[(step_ids < self.oldest_step) | (step_ids >= self.n_added)]

@@ -9,9 +9,9 @@ An episode of T steps takes T + 1 rows that follow each other, so that s' of a s
     reward       r0   r1   r2   -  |  r0   r1
 
 The caller chooses the columns: those that the algorithm and the decoder read. `row` maps the number of a transition to its
-row; the last row of an episode begins no transition. The numbers of rows, transitions and episodes count up from 0 without
-end, and each is stored at its number modulo the capacity. When no row is free, the oldest episode is removed. Every
-environment has its own rows. Everything here is for one seed; callers `vmap`.
+row; the last row of an episode begins no transition. The numbers of rows, transitions and episodes count up from 0, in int32,
+and each is stored at its number modulo the capacity. When no row is free, the oldest episode is removed. Every environment has
+its own rows. Everything here is for one seed, and callers `vmap`; only `hide_newest` also takes all seeds at once.
 
 An environment that pays before the end of an episode has *segments*: each holds the steps that one payment is for. They are stored
 in the same form as episodes. `segments_as_episodes` returns the replay with its segments in place of its episodes, so that all functions
@@ -231,11 +231,16 @@ def n_stored_episodes(replay: Replay) -> Int[Array, " envs"]:
 def mean_length(replay: Replay) -> Int[Array, ""]:
     """Return the mean number of steps of the episodes that have ever finished; 1 before the first."""
     n_steps = jnp.where(replay.running, first_transition(replay, replay.current_episode), replay.next_transition)
-    return jnp.maximum(jnp.sum(n_steps) // jnp.maximum(jnp.sum(replay.current_episode), 1), 1)
+    # In floating point, because the sum over environments may exceed 32 bits.
+    mean = jnp.sum(n_steps.astype(jnp.float32)) / jnp.maximum(jnp.sum(replay.current_episode), 1)
+    return jnp.maximum(jnp.floor(mean), 1).astype(n_steps.dtype)
 
 
 def required_capacity(steps: int, longest: int) -> int:
-    """Return how many rows an environment needs for `steps` new steps and the running episode before them, at most."""
+    """Return how many rows an environment needs at most, for `steps` new steps after a running episode of up to `longest` steps.
+
+    Each new step may be an episode, which takes two rows.
+    """
     return 2 * steps + longest
 
 
@@ -290,6 +295,9 @@ def payment_start(replay: Replay, env: Int[Array, "*batch"], episode: Int[Array,
 
 
 def newest_steps(replay: Replay, steps: int) -> Index:
-    """Return the index of the last steps of every environment: [envs steps]. At least `steps` of each must have been stored."""
+    """Return the index of the last steps of every environment: [envs steps].
+
+    Steps that were never stored, or are not any more, have numbers below `oldest_transition`. The caller masks them.
+    """
     number = replay.next_transition[:, None] - steps + jnp.arange(steps)
     return Index(jnp.broadcast_to(jnp.arange(len(number))[:, None], number.shape), number)

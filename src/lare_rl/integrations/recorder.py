@@ -1,7 +1,7 @@
 """Shows the steps of another library's environments to a `CreditAssigner`."""
 
 from collections.abc import Hashable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import gymnasium
 import numpy as np
@@ -21,7 +21,7 @@ Pay = Literal["proxy", "environment"]
 
 
 class StepRecorder:
-    """Shows steps to an assigner. They become rows of numbers if it only has the sizes of observations and actions, from a task file."""
+    """Shows steps to an assigner. If it knows only sizes, from a task file, steps first become rows of numbers, by these spaces."""
 
     def __init__(
         self,
@@ -31,10 +31,10 @@ class StepRecorder:
         env_ids: Sequence[Hashable],
         agents: int = 1,
     ):
-        """Create a recorder for environments with these spaces of one agent.
+        """Create a recorder for environments with these spaces, which are those of one environment and one agent.
 
         `env_ids` holds a key for each environment, which no other environment of the assigner has. Raises `LareError` if the
-        assigner was made for other sizes, or another number of agents.
+        assigner was made for other spaces or sizes, or another number of agents.
         """
         check_assigner(credit, agents)
         self.credit, self.env_ids = credit, env_ids
@@ -48,7 +48,9 @@ class StepRecorder:
                 raise LareError(
                     f"{kind}s of the environment are rows of {layout.size} numbers, and the assigner was made for {expected[kind].size}"
                 )
-        self._same_space = {kind: layout == expected[kind] for kind, layout in self.layouts.items()}
+            if layout != expected[kind] and expected[kind].kind != "numbers":
+                raise LareError(f"the assigner was made for another {kind}_space than that of the environment")
+        self._has_same_layout = {kind: layout == expected[kind] for kind, layout in self.layouts.items()}
 
     def add(
         self,
@@ -62,11 +64,14 @@ class StepRecorder:
         infos: Sequence[Mapping[str, Any]],
         valid: Bool[np.ndarray, " environments"] | None = None,
     ) -> Int[np.ndarray, " environments"]:
-        """Show one step of each environment, and return their numbers: see `CreditAssigner.add`. `infos` have the groups."""
+        """Show one step of each environment, and return their numbers: see `CreditAssigner.add`.
+
+        `infos` holds one mapping for each environment. Only groups are read from them, so without groups it may be empty.
+        """
         steps = {"observation": observation, "action": action, "next_observation": next_observation}
         for name, value in steps.items():
             kind = name.removeprefix("next_")
-            if not self._same_space[kind]:
+            if not self._has_same_layout[kind]:
                 steps[name] = self.layouts[kind].rows(value, name)
         return self.credit.add(
             **steps,
@@ -112,5 +117,5 @@ def check_capacity(credit: CreditAssigner, n_steps: int) -> None:
 
 def check_pay(pay: str) -> None:
     """Raise `LareError` if `pay` is unknown."""
-    if pay not in ("proxy", "environment"):
+    if pay not in get_args(Pay):
         raise LareError(f"pay = {pay!r} must be 'proxy' or 'environment'")

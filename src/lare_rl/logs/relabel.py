@@ -26,7 +26,7 @@ from lare_rl.logs.open_log import open_log
 from lare_rl.logs.payments import find_payments, make_exact, predict_payments
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding, render
-from lare_rl.util.statistics import FLOAT32_NOISE, correlation, r_squared
+from lare_rl.util.statistics import CONSTANT, FLOAT32_NOISE, correlation, r_squared
 
 __all__ = ["MESSAGES", "Relabelled", "hold_out_flags", "predicted_return_statistics", "relabel"]
 
@@ -50,7 +50,9 @@ MESSAGES = {
     "r2": "The returns of {episodes:count episode} held out of the fit are predicted with an R² of {r2:r2}, with a standard error "
     "of {error:error}.",
     "within_groups": "Within their groups, the R² is {r2:r2}.",
-    "worthless": "Warning: that is no better than their mean. Do not train on these rewards.",
+    "worthless": "Warning: these rewards explain almost nothing of the differences between returns. Do not train on them.",
+    "worthless_within_groups": "Warning: these rewards explain almost nothing of the differences between returns within a group. Do "
+    "not train on them.",
 }
 """The sentences of `Relabelled.findings`."""
 
@@ -77,7 +79,8 @@ class Relabelled:
     group_r2: float
     """R^2 of the differences of these returns from the means of their groups. NaN without groups, and with too few returns."""
     return_correlation: float
-    """Pearson's correlation of these returns with their predictions. NaN for fewer than `MIN_R2_EPISODES`, or if one never varies."""
+    """Pearson's correlation of these returns with their predictions. NaN for fewer than `MIN_R2_EPISODES`, or if the returns or the
+    predictions are all equal."""
     explanation: tuple[str, ...]
     """What the returns say about the factors: `CreditAssigner.explanation`."""
 
@@ -101,8 +104,10 @@ class Relabelled:
             yield Finding("r2", {**episodes, "r2": self.return_r2, "error": self.return_r2_error})
             if not math.isnan(self.group_r2):
                 yield Finding("within_groups", {"r2": self.group_r2})
-            if self.return_r2 < LITTLE_R2 or self.group_r2 < LITTLE_R2:  # false for NaN
+            if self.return_r2 < LITTLE_R2:
                 yield Finding("worthless")
+            elif self.group_r2 < LITTLE_R2:  # false for NaN
+                yield Finding("worthless_within_groups")
         elif math.isnan(self.return_correlation):
             yield Finding("constant", episodes)
         else:
@@ -120,7 +125,10 @@ def predicted_return_statistics(returns: Sequence[float], predictions: Sequence[
 
 
 def _r2_within_groups(returns: Sequence[float], predictions: Sequence[float], groups: Sequence[Any]) -> float:
-    """Return R^2 of what differs within groups. NaN for fewer than `MIN_R2_EPISODES` in groups of two or more."""
+    """Return R^2 of what differs within groups.
+
+    NaN for fewer than `MIN_R2_EPISODES` in groups of two or more, or if the returns of each group are equal.
+    """
     members = [np.flatnonzero([group == other for other in groups]) for group in dict.fromkeys(groups)]
     members = [rows for rows in members if len(rows) > 1]
     if sum(map(len, members)) < MIN_R2_EPISODES:
@@ -129,7 +137,8 @@ def _r2_within_groups(returns: Sequence[float], predictions: Sequence[float], gr
     y, predicted = np.concatenate(
         [values[:, rows] - values[:, rows].mean(axis=1, keepdims=True) for rows in members], 1
     )
-    return r_squared(y, predicted)[0]
+    varies = np.sum(y**2) > CONSTANT * np.sum(values[0] ** 2)  # more than the rounding of the means
+    return r_squared(y, predicted)[0] if varies else math.nan
 
 
 def relabel(
@@ -204,22 +213,22 @@ def relabel(
     bytes_per_step = make_assigner(capacity=1).store.bytes_per_step
     credit = make_assigner(capacity=max(MIN_CAPACITY, int(memory * 2**30 / bytes_per_step)))
     size = _fit(credit, log, hold_out_flags(hold_out, seed), updates, listener)
-    explanation, counts = tuple(credit.explanation()), _Counts()
-    episodes = _compute_rewards(credit, log, hold_out_flags(hold_out, seed), size, counts, listener)
+    explanation, seen = tuple(credit.explanation()), _SecondPass()
+    episodes = _compute_rewards(credit, log, hold_out_flags(hold_out, seed), size, seen, listener)
     name = credit.config.method.name
     comment = f"Rewards by lare-rl relabel, {name}; the old rewards are in infos['paid'], after an entry for the reset."
     path = log.write(out, episodes, overwrite, comment)
-    r2, r2_error, return_correlation = predicted_return_statistics(counts.returns, counts.predictions)
-    group_r2 = _r2_within_groups(counts.returns, counts.predictions, counts.groups)
+    r2, r2_error, return_correlation = predicted_return_statistics(seen.returns, seen.predictions)
+    group_r2 = _r2_within_groups(seen.returns, seen.predictions, seen.groups)
     if not credit.config.method.calibrated:
         r2 = r2_error = group_r2 = math.nan
     return Relabelled(
         out=path,
         method=name,
-        episodes=counts.episodes,
-        steps=counts.steps,
-        cut=counts.cut,
-        held_out=len(counts.returns),
+        episodes=seen.episodes,
+        steps=seen.steps,
+        cut=seen.cut,
+        held_out=len(seen.returns),
         return_r2=r2,
         return_r2_error=r2_error,
         group_r2=group_r2,
@@ -242,8 +251,8 @@ def hold_out_flags(share: float, seed: int) -> Iterator[bool]:
 
 
 @dataclass
-class _Counts:
-    """Running counts of the second pass."""
+class _SecondPass:
+    """What the second pass has seen so far."""
 
     episodes: int = 0
     steps: int = 0
@@ -262,13 +271,13 @@ def _fit(
     """Fit to the complete episodes that are not held out. Return the numbers of episodes and steps in the log."""
     n_episodes, n_steps, n_fitted = 0, 0, 0
     for episode in log.episodes():
+        if episode.complete and (episode.group is not None) != log.layout.has_groups:
+            problem = "no group" if log.layout.has_groups else "a group"
+            raise LareError(
+                f"{episode.name} has {problem}, unlike the first episode: give all episodes a group, or none"
+            )
         if episode.complete and not next(is_held_out):
             n_fitted += 1
-            if (episode.group is not None) != log.layout.has_groups:
-                problem = "no group" if log.layout.has_groups else "a group"
-                raise LareError(
-                    f"{episode.name} has {problem}, unlike the first episode: give all episodes a group, or none"
-                )
             try:
                 reward = episode.reward[-1] if episode.is_score else episode.reward
                 steps = episode.observation, episode.action, episode.next_observation, reward
@@ -291,10 +300,10 @@ def _compute_rewards(
     log: Log,
     is_held_out: Iterator[bool],
     size: tuple[int, int],
-    counts: _Counts,
+    seen: _SecondPass,
     listener: Listener,
 ) -> Iterator[RelabelledEpisode]:
-    """Yield every episode with its rewards, and add it to `counts`.
+    """Yield every episode with its rewards, and add it to `seen`.
 
     Raises `LareError` if the log has another `size` than in the first pass.
     """
@@ -311,22 +320,22 @@ def _compute_rewards(
         )
         r_hats = np.split(r_hats, np.cumsum([len(episode) for episode in batch])[:-1])
         for episode, r_hat, payments in zip(batch, r_hats, batch_payments, strict=True):
-            counts.episodes += 1
-            counts.steps += len(episode)
-            counts.cut += not episode.complete
+            seen.episodes += 1
+            seen.steps += len(episode)
+            seen.cut += not episode.complete
             predicted = predict_payments(r_hat, payments, is_average=is_average)
             if episode.complete and next(is_held_out):
-                counts.returns.append(float(episode.reward.sum()))
+                seen.returns.append(float(episode.reward.sum()))
                 level = None if episode.group is None else credit.group_names.get(episode.group)
-                counts.predictions.append(credit.step_rewards.predicted_return(predicted, level, payments.length))
+                seen.predictions.append(credit.step_rewards.predicted_return(predicted, level, payments.length))
                 if episode.group is not None:
-                    counts.groups.append(episode.group)
+                    seen.groups.append(episode.group)
             if episode.complete and credit.config.spec.is_exact:
                 residual = np.add.reduceat(episode.reward, payments.end - payments.n_since_last) - predicted
                 r_hat = make_exact(r_hat, residual, payments, credit.config.settings)
             yield RelabelledEpisode(episode, r_hat)
-            listener("write", counts.episodes, size[0])
-    new_size = counts.episodes, counts.steps
+            listener("write", seen.episodes, size[0])
+    new_size = seen.episodes, seen.steps
     if new_size != size:
         before, after = (f"{n_episodes} episodes of {n_steps} steps" for n_episodes, n_steps in (size, new_size))
         raise LareError(f"{log.name} changed while it was read: it had {before}, and now {after}")

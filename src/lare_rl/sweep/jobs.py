@@ -104,7 +104,7 @@ def check_job(job: Job) -> None:
                 check_recorded(role, method.phi_kind, job.resolved.draw, job.resolved.candidates)
         return
     config = read_config(job.directory)
-    if config.task.digest != job.task.digest:
+    if config.task != job.task:
         raise LareError(f"{job.directory} holds a run of another task: {ANOTHER_OUT}")
     old, new = effective_settings(config.settings), effective_settings(job.resolved)
     different_names = [name for name, value in new.items() if old.get(name) != value]

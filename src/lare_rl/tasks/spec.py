@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import ConfigDict, Field, StrictInt, field_validator, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, StrictInt, field_validator, model_validator
 
 from lare_rl.errors import CheckedModel, Count, LareError
 from lare_rl.tasks.payments import PaymentRule
@@ -80,6 +80,11 @@ class PaidSteps(CheckedModel):
     """A payment is for this many of the last steps, the one that is paid included."""
 
 
+def _number_to_paid_steps(value: Any) -> Any:
+    """Read `paid_for = 20` as `paid_for = { steps = 20 }`."""
+    return {"steps": value} if type(value) is int else value
+
+
 class TaskSpec(CheckedModel):
     """A task: an environment and the texts that describe it."""
 
@@ -114,7 +119,7 @@ class TaskSpec(CheckedModel):
     payments: Literal["end", "nonzero"] | Annotated[StrictInt, Field(ge=1)] = "end"
     """When the environment pays: once, at the end of an episode; with every reward that is not 0; or every so many steps and at
     the end. Rewards between payments are added up."""
-    paid_for: Literal["since_last"] | PaidSteps = "since_last"
+    paid_for: Annotated[Literal["since_last"] | PaidSteps, BeforeValidator(_number_to_paid_steps)] = "since_last"
     """Steps that a payment is for: all since the last payment, or `{ steps = 20 }`, the last 20 with the one that is paid."""
     group: str | None = None
     """Key of `info` with the group of an episode, a whole number from 0 to 63: its level, map, weather or demand. Each group has
@@ -278,12 +283,13 @@ def unwritten_texts(task: TaskSpec) -> list[str]:
 
 def check_same_tasks(tasks: Iterable[tuple[Path, TaskSpec]]) -> None:
     """Raise `LareError` if two paths have different tasks of the same name."""
-    first: dict[str, tuple[Path, str]] = {}
+    first: dict[str, tuple[Path, TaskSpec]] = {}
     for path, task in tasks:
-        digest = task.digest
-        other, other_digest = first.setdefault(task.name, (path, digest))
-        if other_digest != digest:
-            raise LareError(f"{path} and {other} have different tasks with the name {task.name}: show them separately")
+        other_path, other = first.setdefault(task.name, (path, task))
+        if other != task:
+            raise LareError(
+                f"{path} and {other_path} have different tasks with the name {task.name}: show them separately"
+            )
 
 
 def require_role(task: TaskSpec) -> TaskSpec:
@@ -291,7 +297,6 @@ def require_role(task: TaskSpec) -> TaskSpec:
     if task.teams:
         names = ", ".join(team.name for team in task.teams)
         raise LareError(
-            f"{task.name} has a latent function for each of its teams ({names}). Name the task of one of them instead: the key "
-            "teams of its file lists their files."
+            f"{task.name} has teams ({names}), each with its own latent function: give the task file of one team, which the key teams lists"
         )
     return task

@@ -8,11 +8,13 @@ The service's own settings decide where it stores them, and whether it is reache
 If a service fails, training goes on without it, after a warning: metrics.jsonl has every number.
 """
 
+import contextlib
 import inspect
+import re
 import time
 import warnings
-from collections.abc import Callable, Mapping
-from functools import wraps
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial, wraps
 from typing import Any
 
 from lare_rl.errors import LareError, missing_extra_error
@@ -35,12 +37,19 @@ def _survive_failures(method: Callable[..., None]) -> Callable[..., None]:
             self.has_failed = True
             name = type(self).__name__
             warnings.warn(
-                f"{name} gets no more numbers, because it failed: {one_line(error)}. metrics.jsonl has every number",
+                f"{name} gets no more numbers, because it failed: {one_line(error).rstrip('.')}. metrics.jsonl has every number",
                 RuntimeWarning,
                 stacklevel=2,
             )
 
     return call
+
+
+def _close_all(closers: Iterable[Callable[[], Any]]) -> None:
+    """Close all runs of a service, even if it has failed, or fails for some of them."""
+    for close in closers:
+        with contextlib.suppress(Exception):
+            close()
 
 
 class WeightsAndBiases(Listener):
@@ -76,10 +85,8 @@ class WeightsAndBiases(Listener):
                 self.runs[seed] = self.init(reinit="create_new", **arguments)
             self.runs[seed].log(known_numbers(line), step=line["step"])
 
-    @_survive_failures
     def on_stop(self) -> None:
-        for run in self.runs.values():
-            run.finish()
+        _close_all(run.finish for run in self.runs.values())
 
 
 class MLflow(Listener):
@@ -91,11 +98,12 @@ class MLflow(Listener):
         """Begin or continue an experiment.
 
         Args:
+            experiment: the name of the experiment.
             tracking_uri: the server or the directory; the default is MLflow's own setting.
             parameters: parameters that are saved with every run.
 
         Raises:
-            LareError: mlflow is not installed, or the tracking server or directory cannot be used.
+            LareError: mlflow is not installed, the tracking server or directory cannot be used, or the experiment was deleted.
         """
         try:
             from mlflow import MlflowClient
@@ -109,8 +117,10 @@ class MLflow(Listener):
             self.client = MlflowClient(tracking_uri)
             existing = self.client.get_experiment_by_name(experiment)
             self.experiment = existing.experiment_id if existing else self.client.create_experiment(experiment)
-        except MlflowException as error:
+        except (MlflowException, OSError) as error:
             raise LareError(f"MLflow cannot be used: {error}") from error
+        if existing and existing.lifecycle_stage != "active":
+            raise LareError(f"the experiment {experiment!r} of MLflow was deleted: restore it, or choose another name")
         self.name, self.has_failed = "", False
         self.runs: dict[int, str] = {}
         """The ids of the service's runs, by seed."""
@@ -127,10 +137,13 @@ class MLflow(Listener):
                 run = self.client.create_run(self.experiment, run_name=f"{self.name} seed {seed}")
                 self.runs[seed] = run.info.run_id
                 self.client.log_batch(self.runs[seed], params=self.parameters)
-            numbers = [self.metric(key, value, now_ms, line["step"]) for key, value in known_numbers(line).items()]
+            numbers = [
+                self.metric(
+                    re.sub(r"[^\w.: /-]", "_", key), value, now_ms, line["step"]
+                )  # MLflow refuses other characters
+                for key, value in known_numbers(line).items()
+            ]
             self.client.log_batch(self.runs[seed], metrics=numbers)
 
-    @_survive_failures
     def on_stop(self) -> None:
-        for run in self.runs.values():
-            self.client.set_terminated(run)
+        _close_all(partial(self.client.set_terminated, run) for run in self.runs.values())

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 __all__ = [
     "CLEAR_ERRORS",
+    "CONSTANT",
     "FLOAT32_NOISE",
     "Band",
     "column_correlations",
