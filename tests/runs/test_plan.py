@@ -85,7 +85,7 @@ def test_options_win_over_the_file(write, monkeypatch, tmp_path):
     ("text", "words"),
     [
         ("stepz = 1", "there is no key 'stepz' (did you mean 'steps'?)"),
-        ("tasks = 'x'", "there is no key 'tasks' (did you mean 'task'?)"),
+        ("tasks = 'x'", "the file of a sweep"),
         ("[settings]\nsteps = 1", "write the keys of [settings] outside of this table"),
         ("steps = 'many'", "steps = 'many': input should be a valid integer"),
         ("function = 1", "function = 1: "),

@@ -198,7 +198,7 @@ def test_interrupted_sweep_saves_its_run(file, tmp_path, monkeypatch, default_in
 
     thread = threading.Thread(target=interrupt)
     thread.start()
-    with pytest.raises(RunInterruptedError, match="all running runs were saved"):
+    with pytest.raises(RunInterruptedError, match="asked to save"):
         run_sweep(resources, [job], ignore)
     thread.join()
     log = job.directory.with_name("dense-td3.log").read_text().splitlines()
@@ -265,9 +265,9 @@ def test_end_of_process(file, python_script, script, error):
         (('["Reacher-v4"]', "[]"), r"tasks = \[\]: should not be empty"),
         (('["Reacher-v4"]', '["Reacher-v5"]'), "no recorded reply .* 'Reacher-v5'"),
         (("rollout_steps = 50", 'method = "rd"'), "method.*methods = "),
-        (("[settings]", '[functions]\nReacher = ["phi.py"]\n[settings]'), "functions of Reacher,"),
+        (("[settings]", '[functions]\nReacher = ["phi.py"]\n[settings]'), "names the task Reacher,"),
         (('["Reacher-v4"]', '["Reacher-v4", "Reacher-v4"]'), "Reacher-v4/dense-td3 .*twice"),
-        (('"dense", ', '"dense", "dense", '), "dense-td3 .*twice: leave one out"),
+        (('"dense", ', '"dense", "dense", '), "dense-td3 .*twice: remove one"),
         (("[settings]", "[settings]\nsac = { gamma = 0.9 }"), r"sac\.gamma.*td3\.gamma"),
         (("[settings]", "[settings]\ncredit = { sum_form = true }"), r"no run uses credit\.sum_form.*dense"),
         ((', "lare-linear"', ""), "draws"),

@@ -17,6 +17,7 @@ from lare_rl.envs.interface import JaxEnv
 from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.play import make_episode
 from lare_rl.runs.directory import Run
+from lare_rl.tasks.payments import is_paid
 from lare_rl.training.collect_device import make_jax_env, unroll_on_device
 from lare_rl.training.decoder_inputs import compute_host_factors
 from lare_rl.training.episodes import predict_returns
@@ -44,18 +45,18 @@ N_SAMPLE_EPISODES = 40
 
 @dataclass(frozen=True, kw_only=True)
 class PlayedEpisodes:
-    """Whole episodes of the first seed's policy."""
+    """Whole episodes of one policy, with the decoders of the first seed."""
 
     config: TrainConfig
     steps: Trajectory
     """[time episodes ...]."""
     mask: Bool[np.ndarray, "time episodes"]
-    """Whether the episode had not ended before the step."""
+    """True while the episode runs, false for the padding after it."""
     factors: Float[np.ndarray, "time episodes rows factors"]
     proxy_reward: Float[np.ndarray, "time episodes agents"] | None
     """By the decoders of the last checkpoint, in the unit of the return. None for a method without proxy rewards."""
     state: Any
-    """The states after each step, if the environment is in JAX."""
+    """The states after each step, [time episodes ...], if the environment is in JAX; else None."""
 
     @property
     def reward(self) -> Float[np.ndarray, "time episodes agents"]:
@@ -74,12 +75,15 @@ class PlayedEpisodes:
 
 
 def play_run(run: Run, n_episodes: int = 1, *, actor: Any = None, key: int = 0) -> PlayedEpisodes:
-    """Play episodes with the noise of training.
+    """Play episodes with sampled actions, as in training.
 
     Args:
         run: the run, which must have a checkpoint.
         actor: an actor with an axis of one seed; by default, that of the run's first seed.
-        key: the number of the random key, if the environment is in JAX.
+        key: the seed of the random key, if the environment is in JAX. Others start like the first training episodes.
+
+    Raises:
+        LareError: the run has no checkpoint, or a factor is not finite.
     """
     state = load_learner(run)
     config, learner = state.config, state.learner
@@ -109,7 +113,7 @@ def unroll_policy(env: JaxEnv, config: TrainConfig, actor: Any, n_episodes: int,
 
 
 def _unroll_on_host(run: Run, config: TrainConfig, actor: Any, n_episodes: int) -> EpisodeBatch:
-    """Play as many episodes at a time as environments may be open. Their number does not affect an episode."""
+    """Play as many episodes at a time as environments may be open. How many are open does not change an episode."""
     seeds, task, batches = run.seeds[:1], run.config.task, []
     with make_vec_env(task, n_open_envs(task, 1, n_episodes)) as envs:
         for numbers, policy in policy_batches(envs, replace(config, deterministic=False), actor, seeds, n_episodes):
@@ -139,7 +143,9 @@ def compute_proxy_rewards(
     """Compute the proxy rewards of whole episodes by the decoders of a single seed, in the unit of the return."""
     n_steps, n_episodes = np.shape(steps.next_timestep.terminated)
     # Rewards are computed from stored steps, so a new replay stores these episodes alone.
-    buffer = empty_replay(config, n_episodes, 2 * n_steps + 2)  # a repeated last step is an episode of two rows
+    buffer = empty_replay(
+        config, n_episodes, 2 * n_steps + 2
+    )  # each repeated last step is stored as an episode of two rows
 
     @jax.jit
     def compute(steps: Trajectory, factors: Array) -> Array:
@@ -163,7 +169,7 @@ class TeamSample:
     reward: Float[np.ndarray, " rows"]
     """The true reward."""
     has_step_rewards: bool = True
-    """Whether the true rewards of single steps are known: they are not if only the last steps of episodes have one."""
+    """Whether the true rewards of single steps are known: they are not if only steps with a payment have one."""
 
     @property
     def correlations(self) -> Float[np.ndarray, " factors"]:
@@ -177,8 +183,11 @@ def sample_steps(run: Run, actor: Any = None) -> list[TeamSample]:
     """Return steps of each team, from `N_SAMPLE_EPISODES` episodes of `play_run`."""
     played = play_run(run, N_SAMPLE_EPISODES, actor=actor, key=1)
     config, samples = played.config, []
-    last = played.mask & ~np.append(played.mask[1:], np.zeros_like(played.mask[:1]), axis=0)
-    is_known = bool(has_step_rewards(played.reward, last[..., None], played.mask[..., None]))
+    ended = played.mask & ~np.append(played.mask[1:], np.zeros_like(played.mask[:1]), axis=0)
+    is_last = is_paid(
+        config.payments, np.arange(len(ended))[:, None], played.reward, ended
+    )  # of the steps that a payment is for
+    is_known = bool(has_step_rewards(played.reward, is_last[..., None], played.mask[..., None]))
     steps = jax.tree.map(lambda leaf: np.asarray(leaf)[played.mask], played.steps)  # [steps ...]
     for team_index, role in enumerate(run.config.task.roles):  # its rows of all episodes, as if they were one
         rows = make_episode(role, config.env, steps.timestep, steps.env_action, steps.next_timestep)

@@ -2,10 +2,12 @@
 
 DIRECTORY/
   export.json                task, method, algorithm, seed, the policy's step; inputs, outputs and operations of each function
-  policy.npz, .onnx          observation -> action
+  policy.npz, .onnx          observation -> action (other inputs and outputs: `policy_graph.py`); .onnx if onnx is installed
   reward.npz, .onnx          steps -> r_hat, phi and decoder as one function; one reward_TEAM each if several teams learn
   latent_function.py, .json  the source of phi, and how it was made; one latent_function_TEAM each if several teams learn
   exported.py, evaluate.py   NumPy code that evaluates the functions in export.json and the .npz files
+
+A method whose rewards cannot be exported (`ExportResult.no_reward_reason`) has no files of rewards.
 """
 
 import json
@@ -21,7 +23,7 @@ from lare_rl.export.reward_graph import missing_reward_reason, reward_graph
 from lare_rl.phi import evaluate
 from lare_rl.phi.graph import Gather, Graph, Node
 from lare_rl.phi.onnx import BATCH, DTYPES, is_onnx_installed, onnx_model
-from lare_rl.runs.directory import Run, as_run, function_filename
+from lare_rl.runs.directory import Run, as_run, function_filename, function_suffix
 from lare_rl.training.saved_state import load_actor, load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.util.files import new_directory, replace_npz, write_bytes
@@ -43,17 +45,20 @@ class ExportResult(NamedTuple):
 
 
 def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, best: bool = False) -> ExportResult:
-    """Write the policy and the reward functions of a seed to a directory that must not exist.
+    """Write the policy and the reward functions of a seed to a directory.
 
-    A policy returns its most likely action; of discrete actions in PPO and IPPO, also the logits. Rewards are those of the last
+    The policy returns its most likely action. PPO and IPPO with discrete actions also return the logits. Rewards are those of the last
     checkpoint's decoder, in the unit of the return (of `llm-reward`: as the function returns them).
 
     Args:
+        run: the run, or its directory.
+        out: the directory to write, which must not exist.
         seed: one of the run's seeds; the default is the first.
         best: write the policy of the seed's best evaluation, instead of the last policy. Proxy rewards are always the last ones.
 
     Raises:
-        LareError: there is no such seed, no checkpoint, or the directory exists or cannot be written.
+        LareError: there is no such seed, no checkpoint or no best policy, the policy has an operation that cannot be exported, or the
+            directory exists or cannot be written.
     """
     out, run = Path(out), as_run(run)
     seed_index, task, settings = run.seed_index(seed), run.config.task, run.config.settings
@@ -70,16 +75,16 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
     if no_reward_reason is None:
         for team_index, role in enumerate(task.roles):
             phi = run.functions[team_index] if run.functions else None
-            graph = reward_graph(decoders[team_index], config, team_index, phi)
-            graphs["reward" if role is task else f"reward_{role.team}"] = graph
+            name = "reward" + function_suffix(task, role)
+            graphs[name] = reward_graph(decoders[team_index], config, team_index, phi)
     descriptions = {name: _describe_graph(graph) for name, graph in graphs.items()}
     if config.env.discrete and not config.team_level:  # for `exported.reward`, which makes one-hot rows of choices
         choices = {"first": config.env.first_choice, "count": config.env.action_size}
-        descriptions |= {name: {**descriptions[name], "choices": choices} for name in graphs if name != "policy"}
-    if (
-        config.env.choice_sizes
-    ):  # the policy returns the number of a combination: np.unravel_index(number, choice_sizes)
-        descriptions["policy"] = {**descriptions["policy"], "choice_sizes": config.env.choice_sizes}
+        for name in graphs.keys() - {"policy"}:
+            descriptions[name]["choices"] = choices
+    # The policy returns the number of a combination of choices: np.unravel_index(number, choice_sizes).
+    if config.env.choice_sizes:
+        descriptions["policy"]["choice_sizes"] = config.env.choice_sizes
     origin = {"method": settings.method, "algorithm": settings.algorithm, "seed": run.seeds[seed_index], "step": step}
     with new_directory(out) as new:
         _write_files(new, graphs, {"lare": code_version(), "task": task.name, **origin, **descriptions})

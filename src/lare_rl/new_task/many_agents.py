@@ -1,8 +1,10 @@
 """Drafts the task file of a PettingZoo environment and, if its agents are of several kinds, one for each team."""
 
 import contextlib
+import glob
 import inspect
 import json
+import math
 import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,7 +26,7 @@ __all__ = ["draft_multi_agent_task", "make_stub", "write_team_drafts"]
 GENERIC_MAKERS = ("parallel_env", "env", "raw_env")
 """Names of functions that say nothing about the environment. Its draft is named after the module."""
 
-IRRELEVANT = re.compile(
+IGNORED_LINES = re.compile(
     r"^(This environment is part of|Please read that page)|\bobservations?( space)?: |\baction space: "
 )
 """Lines of documentation that do not belong to the description."""
@@ -56,7 +58,7 @@ def draft_multi_agent_task(environment_id: str) -> Draft:
     lines = [
         draft.GROUP_LINE,
         *([] if limit else [draft.LIMIT_LINE]),
-        *([f"# arguments = {{ {arguments} }} # the defaults, unless they are set here"] if arguments else []),
+        *([f"# arguments = {{ {arguments} }} # the defaults; to change them, remove the first #"] if arguments else []),
     ]
     with contextlib.closing(ParallelHost(env, task)) as host:
         texts, removed = _read_texts(getattr(env, "unwrapped", env))
@@ -103,26 +105,34 @@ def make_stub(name: str, environment: str, agents: Iterable[Any] = (), **keys: A
     names = list(map(str, agents))
     # Names that are numbers say nothing about kinds.
     kinds = [] if all(name.isdigit() for name in names) else list(dict.fromkeys(map(agent_kind, names)))
-    teams = [stub(kind, team=kind, agents=_name_patterns(kind)) for kind in kinds if len(kinds) > 1]
-    return stub(name, teams=teams, **keys)
+    if len(kinds) < 2:
+        return stub(name, **keys)
+    return stub(name, teams=[stub(kind, team=kind, agents=_name_patterns(kind, names)) for kind in kinds], **keys)
 
 
-def _name_patterns(kind: str) -> tuple[str, ...]:
-    """Return patterns that match the agents of a kind. An agent without a number has the name of its kind."""
-    return (kind, f"{kind}_[0-9]*", f"{kind}[0-9]*")
+def _name_patterns(kind: str, names: Sequence[str]) -> list[str]:
+    """Return patterns that match the agents of a kind and no others. An agent without a number has the name of its kind."""
+    members, stem = [name for name in names if agent_kind(name) == kind], glob.escape(kind)
+    patterns = [
+        pattern
+        for pattern in (stem, f"{stem}_[0-9]*", f"{stem}[0-9]*")
+        if any(fnmatchcase(name, pattern) for name in members)
+    ]
+    matched_names = [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]
+    return patterns if matched_names == members else list(map(glob.escape, members))
 
 
 def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Return the texts by their keys, and the removed lines, from the docstring of the class or of its module."""
+    """Return the texts by their keys, and the removed lines, from the docstring of the class or of its module, the longer one."""
     module = sys.modules.get(type(env).__module__)
     docstrings = type(env).__doc__ or "", getattr(module, "__doc__", None) or ""
     sections = split_sections(max(docstrings, key=len))
-    titled = next((body for title, body in sections.items() if title and body.strip()), "")
+    titled = next((body for title, body in sections.items() if title not in ("", "arguments") and body.strip()), "")
     summary = sections.get("description") or f"{sections['']}\n\n{titled}"
     # PettingZoo's pages begin with a table about the library, not about the task.
-    rows = [line for line in summary.splitlines() if not line.strip().startswith("|")]
-    about = plain_lines("\n".join(rows))
-    lines = {"description": [line for line in about if not IRRELEVANT.search(line)]}
+    lines_without_tables = [line for line in summary.splitlines() if not line.strip().startswith("|")]
+    about = plain_lines("\n".join(lines_without_tables))
+    lines = {"description": [line for line in about if not IGNORED_LINES.search(line)]}
     for key in TEAM_KEYS:
         mentions = [line for line in about if re.search(rf"\b{key}s?( space)?: ", line)]
         lines[key] = first_section(sections, TITLES[key]) or mentions
@@ -130,19 +140,23 @@ def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
 
 
 def _team_lines(env: MultiAgentEnv, team: Team) -> list[str]:
-    names = [str(agent.name) for agent in env.layout.agents[team.agents]]
-    patterns = [pattern for pattern in _name_patterns(team.name) if any(fnmatchcase(name, pattern) for name in names)]
-    keys = {"team": team.name, "agents": patterns}
+    names = [str(agent.name) for agent in env.layout.agents]
+    keys = {"team": team.name, "agents": _name_patterns(team.name, names)}
     return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in keys.items()]
 
 
 def _team_texts(env: MultiAgentEnv, team: Team, texts: Mapping[str, str]) -> dict[str, str]:
-    """Return the texts of a team: the lines that do not begin with the name of another team."""
+    """Return the texts of a team: without the lines that begin with the name of another team, unless they name this one too."""
     other_teams = {other.name.lower() for other in env.spec.teams} - {team.name.lower()}
+
+    def is_about_others(line: str) -> bool:
+        first_word = re.split(r"[\s:_]", line.lower(), maxsplit=1)[0]
+        return first_word in other_teams and not re.search(rf"\b{re.escape(team.name)}", line, re.IGNORECASE)
+
     team_texts = dict(texts)
     for key in TEAM_KEYS:
         lines = texts[key].splitlines()
-        team_texts[key] = "\n".join(line for line in lines if line.split(" ")[0].lower() not in other_teams)
+        team_texts[key] = "\n".join(line for line in lines if not is_about_others(line))
     if texts["description"]:
         team_texts["description"] += f"\nYou judge each agent that is called {team.name}, from what it observes itself."
     return team_texts
@@ -153,10 +167,10 @@ def _describe_spaces(env: MultiAgentEnv, team: Team) -> dict[str, str]:
     agent, spec = env.layout.agents[team.start], env.spec
     flattening, padding = draft.describe_flattening(agent.observation_space), _describe_padding(env.layout, agent)
     has_fewer_actions = agent.discrete and agent.action_size < spec.action_size
-    limit = f"; {agent.name} has only the first {agent.action_size}" if has_fewer_actions else ""
+    fewer_actions = f"; {agent.name} has only the first {agent.action_size}" if has_fewer_actions else ""
     return {
         "observation": f"{count_entries(spec.observation_size)}{flattening}{padding}.",
-        "action": f"{count_entries(spec.action_size)}{draft.describe_action(agent.action_space)}{limit}.",
+        "action": f"{count_entries(spec.action_size)}{draft.describe_action(agent.action_space)}{fewer_actions}.",
     }
 
 
@@ -175,5 +189,9 @@ def _default_arguments(env: Any) -> str:
         signature = inspect.signature(type(getattr(env, "unwrapped", env)).__init__)
     except (TypeError, ValueError):
         return ""
-    simple = [item for item in signature.parameters.values() if isinstance(item.default, bool | int | float | str)]
-    return ", ".join(f"{item.name} = {json.dumps(item.default)}" for item in simple if item.name != "render_mode")
+    defaults = {name: item.default for name, item in signature.parameters.items() if name != "render_mode"}
+    return ", ".join(
+        f"{name} = {json.dumps(value, ensure_ascii=False)}"
+        for name, value in defaults.items()
+        if isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value))
+    )

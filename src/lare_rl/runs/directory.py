@@ -178,12 +178,17 @@ def default_directory(task: TaskSpec, settings: ResolvedSettings) -> Path:
 
 def function_filename(task: TaskSpec, role: TaskSpec) -> str:
     """Return the name of the file of a role's latent function."""
+    return f"latent_function{function_suffix(task, role)}.py"
+
+
+def function_suffix(task: TaskSpec, role: TaskSpec) -> str:
+    """Return the ending of the names of a team's files, such as `_predator`; empty without teams."""
     if role is task:
-        return "latent_function.py"
+        return ""
     team = re.sub(r"[^\w.\-]", "-", str(role.team))
     if team != role.team:  # several teams may have become the same
         team += f"-{task.teams.index(role)}"
-    return f"latent_function_{team}.py"
+    return f"_{team}"
 
 
 def function_paths(directory: Path, config: Config) -> list[tuple[TaskSpec, Path]]:

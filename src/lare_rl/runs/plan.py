@@ -27,20 +27,22 @@ __all__ = ["RunPlan", "load_config"]
 
 @dataclass(frozen=True)
 class RunPlan:
-    """What a file says of a run. Whatever it does not say is None."""
+    """What a file says of a run. Whatever it does not say is None, or has the default of `Settings`."""
 
     task: str | TaskSpec | None = None
     settings: Settings = field(default_factory=Settings)
     function: "tuple[Path | LatentFunction, ...] | None" = None
+    """The latent functions: one or, of several teams, one for each. None: those that the settings name."""
     out: Path | None = None
+    """The directory of the run."""
     source: Path | None = None
     """The file, or the directory of the run."""
     is_run: bool = False
-    """Whether it is the configuration of an earlier run, which has all settings."""
+    """Whether it is the configuration of an earlier run, which has all settings that it used."""
 
     @property
     def values(self) -> dict[str, Any]:
-        """The settings that the file has, in nested tables."""
+        """The settings that the file has, in nested tables. A table of hyperparameters is complete, with defaults."""
         return self.settings.model_dump(exclude_unset=True)
 
     def has_same_value(self, name: str, settings: Settings) -> bool:
@@ -94,6 +96,8 @@ def load_config(path: str | Path) -> RunPlan:
             raise LareError(f"{path}: it is the {CONFIG} of a run: name the run directory, which has the functions too")
         return _plan_repetition(path.parent)
     try:
+        if "tasks" in values:
+            raise LareError("this is the file of a sweep: lare-rl sweep trains it")
         if "settings" in values:
             raise LareError("write the keys of [settings] outside of this table, which only a sweep has")
         file = _PlanFile(**values)

@@ -10,7 +10,7 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from lare_rl.config.effective import describe_unused_settings
 from lare_rl.config.settings import Settings
@@ -30,6 +30,10 @@ Names = Annotated[tuple[str, ...], Field(min_length=1)]
 Draws = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
 
+def _path_to_tuple(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
 class Sweep(Resources):
     """The contents of a sweep's file. Paths are relative to the file."""
 
@@ -40,8 +44,8 @@ class Sweep(Resources):
     """By default, the algorithm of each task."""
     draws: Draws = (0,)
     """Draws of the latent functions from the recorded replies. Methods without a latent function are trained once."""
-    functions: dict[str, tuple[Path, ...]] = Field(default_factory=dict)
-    """Files of latent functions by the name of their task, one for each team. By default, recorded replies are used."""
+    functions: dict[str, Annotated[tuple[Path, ...], BeforeValidator(_path_to_tuple)]] = Field(default_factory=dict)
+    """Files of latent functions by the name of their task: one, or one for each team. By default, recorded replies are used."""
     settings: dict[str, Any] = Field(default_factory=dict)
     """Other settings of `lare-rl train`, such as steps and seeds."""
     out: Path | None = None
@@ -78,7 +82,9 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
         directories: set[Path] = set()
         for job in jobs:
             if job.directory in directories:
-                raise LareError(f"{job.name} is listed twice: leave one out, or give two task files two names")
+                raise LareError(
+                    f"{job.name} is listed twice: remove one, or, if these are two task files, give them different names"
+                )
             directories.add(job.directory)
             check_job(job)
         _check_settings(jobs)
@@ -92,8 +98,14 @@ def run_sweep(
 ) -> list[Job]:
     """Train the jobs that are not done, on this machine or on a Ray cluster. Return the jobs that failed.
 
+    Args:
+        resources: what each run uses, such as a `Sweep`.
+        jobs: the runs.
+        listener: called with messages.
+        ray: the address of a Ray cluster, or "local"; None: this machine, without Ray.
+
     Raises:
-        RunInterruptedError: the user stopped it.
+        RunInterruptedError: the user pressed Ctrl-C.
         LareError: there are not enough cores or accelerators, or Ray is not available.
     """
     todo = [job for job in jobs if not job.done]
@@ -110,7 +122,7 @@ def run_sweep(
                 if error:
                     failed.append(job)
     except KeyboardInterrupt:
-        saved = "all running runs were saved, and the same command continues them"
+        saved = "the running runs were asked to save, and the same command continues them"
         if ray is not None:  # which does not ask them to save
             saved = "the same command continues the runs from their last checkpoints"
         raise RunInterruptedError(f"stopped; {saved}") from None
@@ -132,9 +144,11 @@ def _make_jobs(sweep: Sweep, path: Path) -> Iterator[Job]:
     tasks = [load_task(resolve_path(str(path), name)) for name in sweep.tasks]
     names = [task.name for task in tasks]
     if unknown := sorted(sweep.functions.keys() - set(names)):
-        raise LareError(f"functions of {unknown[0]}, which is none of the tasks {', '.join(names)}")
+        raise LareError(f"[functions] names the task {unknown[0]}, but the tasks are {', '.join(names)}")
     if sweep.draws != (0,) and sweep.functions.keys() >= set(names):
-        raise LareError("draws choose recorded replies, but all tasks have functions in [functions]: leave out either")
+        raise LareError(
+            "draws choose recorded replies, but all tasks have functions in [functions]: remove draws, or remove [functions]"
+        )
     for task, method, algorithm in product(tasks, sweep.methods, sweep.algorithms or (None,)):
         functions = [path.parent / function for function in sweep.functions.get(task.name, ())]
         for draw in sweep.draws if METHODS.find(method).needs_phi and not functions else (0,):
