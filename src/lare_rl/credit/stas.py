@@ -5,8 +5,9 @@ The mean over the coalitions approximates the Shapley value of an agent:
 
     r_hat_{i,t} = w . mean_k attention(h_t, mask_k)_i,    mask_k ~ Bernoulli(1/2)^{n x n}, 1 on the diagonal
 
-During learning, each batch has its own samples of coalitions, agent numbers and dropout. A reward is the mean over `REWARD_SAMPLES`
-samples, which are the same at each call.
+w includes a bias, the result is multiplied by `CreditSpec.output_scale`, and k = 1..`COALITIONS`. During learning, each batch has its own
+samples of coalitions, of the order of agents' index embeddings, and of dropout. A reward is the mean over `REWARD_SAMPLES` samples,
+which are the same at each call.
 """
 
 from collections.abc import Callable
@@ -33,7 +34,7 @@ def dropout(x: Float[Array, "..."], key: PRNGKeyArray | None) -> Float[Array, ".
     """Set half of the entries, chosen at random, to 0 and double the others. Without a key, return x."""
     if key is None:
         return x
-    # One random bit per entry: a random number per entry would take a fifth of the time of STAS.
+    # One random bit per entry: a random float per entry would take a fifth of the run time of STAS.
     coins = jnp.unpackbits(jax.random.bits(key, (-(-x.size // 8),), jnp.uint8))
     return 2 * x * coins[: x.size].reshape(x.shape)
 
@@ -54,7 +55,7 @@ def _split_heads(x: Float[Array, "*batch size"]) -> Float[Array, "*batch heads h
 
 
 class TimeLayer(eqx.Module):
-    """a = attention(x), out = LN(FF(LN(x + a)) + 2 a). As published, x itself is not added again."""
+    """a = attention(x), out = LN(FF(LN(x + a)) + 2 a). As published, x itself is not added again. `HEADS` divides the size."""
 
     query: Linear
     key: Linear
@@ -81,7 +82,10 @@ class TimeLayer(eqx.Module):
 
 
 class Coalitions(eqx.Module):
-    """Attention over agents with random numbers, averaged over random coalitions. Each agent has its own projection to queries."""
+    """Attention over agents, averaged over random coalitions. Each agent has its own projection to queries, and `HEADS` divides the size.
+
+    To each agent an index embedding is added, in a random order.
+    """
 
     query: Linear
     """The layers of all agents, stacked."""
@@ -101,16 +105,15 @@ class Coalitions(eqx.Module):
         key: PRNGKeyArray,
         dropout_key: PRNGKeyArray | None,
     ) -> Float[Array, "*batch agents size"]:
-        """Return the attention for one sample of coalitions, and of which agent has which of the embedded numbers."""
+        """Return the mean over `COALITIONS` random masks, with one random order of the index embeddings `numbers`."""
         agents = len(numbers)
         mask_key, order_key = jax.random.split(key)
         x = x + numbers[jax.random.permutation(order_key, agents)]
         dropout_keys = split_key(dropout_key, 2)
         query = _split_heads(jnp.einsum("...ad,ade->...ae", x, self.query.weight) + self.query.bias)
-        # Returns are predicted where float64 is on. A probability in float32 has the same coins there.
-        mask = jax.random.bernoulli(mask_key, jnp.float32(0.5), (COALITIONS, agents, agents)) | jnp.eye(
-            agents, dtype=bool
-        )
+        # Returns are predicted where float64 is on. With a probability in float32, the random draws are the same there.
+        coins = jax.random.bernoulli(mask_key, jnp.float32(0.5), (COALITIONS, agents, agents))
+        mask = coins | jnp.eye(agents, dtype=bool)
         attention = attend(
             jnp.tile(query, (COALITIONS, 1, 1)),  # each agent needs a query for each coalition
             _split_heads(self.key(x)),
@@ -129,7 +132,7 @@ class STAS(eqx.Module):
     """Embeds the observation and the one-hot action."""
     position: Float[Array, "steps size"]
     agent_number: Float[Array, "agents size"]
-    """Embeddings of agent numbers."""
+    """The index embeddings of agents."""
     layers: tuple[TimeLayer, ...]
     coalitions: Coalitions
     head: Linear
@@ -146,6 +149,10 @@ class STAS(eqx.Module):
         self.head = Linear(SIZE, 1, key=head_key)
 
     def __call__(self, inputs: Float[Array, "rows agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
+        """Return the rewards of whole episodes, one after another, each of exactly `spec.max_steps` rows.
+
+        Without a key there is no dropout, and the rewards are means over `REWARD_SAMPLES` samples.
+        """
         rows, agents = inputs.shape[:2]
         x = self.embed(inputs).reshape(-1, len(self.position), agents, SIZE)
         x = jnp.swapaxes(x, 1, 2) + self.position
@@ -162,6 +169,6 @@ class STAS(eqx.Module):
     def agent_rewards(
         self, x: Float[Array, "episodes steps agents size"], key: PRNGKeyArray, dropout_key: PRNGKeyArray | None
     ) -> Float[Array, "episodes steps agents"]:
-        """Return the agents' rewards for one sample of coalitions and of agent numbers."""
+        """Return the agents' rewards for one sample of coalitions and of the order of index embeddings."""
         x = self.coalitions(x, self.agent_number, key, dropout_key)
         return self.output_scale * self.head(x)[..., 0]

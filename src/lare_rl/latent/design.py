@@ -21,13 +21,12 @@ __all__ = ["Conversation", "DesignError", "check_recorded", "design", "examine_r
 
 
 class DesignError(LareError):
-    """No attempt passed.
+    """No attempt passed, or an error or Ctrl-C came after the first reply.
 
     Attributes:
         recorder: holds all exchanges with the model.
         model: the name of the model.
-        status: the exit status of the command line: 1; 2 if the model became unavailable before an attempt passed, and 130 if
-            the user stopped the design.
+        status: the exit status of the command line: 1 if no attempt passed, 130 after Ctrl-C, and 2 for another error.
     """
 
     def __init__(self, message: str, recorder: Recorder, model: str, status: int = 1):
@@ -37,7 +36,7 @@ class DesignError(LareError):
 
 @contextlib.contextmanager
 def keep_replies(recorder: Recorder, model: Model) -> Iterator[None]:
-    """Raise a `DesignError` with the replies so far in place of another error, and if the user stops."""
+    """If an error or Ctrl-C comes after the first reply, raise a `DesignError` that has the replies."""
     try:
         yield
     except (LareError, KeyboardInterrupt) as error:
@@ -143,7 +142,7 @@ class Conversation:
 
 
 def check_recorded(task: TaskSpec, kind: FunctionKind, draw: int, candidates: int) -> None:
-    """Raise `LareError` if the shipped recordings lack a reply that a design needs when every candidate passes."""
+    """Raise `LareError` if the shipped recordings lack a reply that a design needs. Every candidate is assumed to pass."""
     model, request = recorded_model(task.name, kind, draw), prompts.candidate(task, kind)
     replies = [model.reply(request, number) for number in range(candidates)]
     if candidates > 1:
@@ -168,22 +167,25 @@ def design(
         err          <- verify(phi, s)
         xi           <- M(task, role, xi_1..n, err)         Eq. 4: correct, while there are errors
 
+    M is the model, xi a reply, role the system message, s sampled steps, and err the errors that they show.
+
     Args:
         task: a name, a path, or a spec.
         kind: several factors, or one reward.
         model: the language model to ask: an object with `name` and `reply(messages, number)`, or a function from messages to a
             text. Without one, the shipped recordings answer.
-        draw: the number of the shipped recording that answers (0 to 4). It is independent of the training seed.
+        draw: the number of the shipped recording that answers (0 to 4), without a `model`. It is independent of the training seed.
         candidates: n. With 1 (the paper's ablation without self-prompting), nothing is combined.
         pre_verification: without it (the paper's ablation), the first function that can be read is accepted.
-        record: the file to which every exchange is written, from the first reply on.
+        record: the file to which every exchange is written, from the first reply on. It must not exist.
+        on_message: called with messages about attempts.
         steps: observations (n, observation size) and actions (n, action size) that functions are tried on if there is no
             environment, as `lare_rl.logged_steps` reads them from a data set.
 
     Raises:
-        DesignError: no attempt passed, the model became unavailable, or the user stopped the design.
-        LareError: there is no such kind, the model cannot answer, the environment does not run, or each team of the task needs
-            its own function.
+        DesignError: no attempt passed, or an error or Ctrl-C came after the first reply.
+        LareError: there is no such kind, the model does not answer the first request, `record` exists, the environment does not run,
+            or each team of the task needs its own function.
     """
     task = require_role(resolve_task(task, playable=steps is None))
     check_kind(kind)

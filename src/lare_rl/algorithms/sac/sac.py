@@ -1,10 +1,10 @@
 """SAC: soft actor-critic with a learned temperature (Haarnoja et al., "Soft actor-critic algorithms and applications", 2018).
 
-    a'    ~ pi(. | s'),  a ~ pi(. | s),  and the replay has the action b
+    (s, a, r, s') is from the replay;  a' ~ pi(. | s'),  a_new ~ pi(. | s)
     y     = r + gamma * (1 - terminated) * (min_i Q'_i(s', a') - alpha log pi(a' | s'))
-    Q_i  <- descend mean (Q_i(s, b) - y)^2                              Eq. 5, 6
-    pi   <- descend mean (alpha log pi(a | s) - min_i Q_i(s, a))        Eq. 9
-    alpha <- descend -alpha mean (log pi(a | s) + H),  H = -dim(A)      Eq. 18
+    Q_i  <- descend mean (Q_i(s, a) - y)^2                                      Eq. 5, 6
+    pi   <- descend mean (alpha log pi(a_new | s) - min_i Q_i(s, a_new))        Eq. 9
+    alpha <- descend -alpha mean (log pi(a_new | s) + H),  H = -dim(A)          Eq. 18
     Q'   <- (1 - tau) Q' + tau Q                                        every target_every-th update
 
 The policy is a normal distribution squashed by a tanh, pi = tanh(N(mu(s), sigma(s))), in [-1, 1].
@@ -49,7 +49,7 @@ def init(key: PRNGKeyArray, observation_size: int, action_size: int, settings: S
     actor_key, critic_key = jax.random.split(key)
     actor = MLP(observation_size, settings.hidden, 2 * action_size, key=actor_key)
     critics = init_critics(critic_key, observation_size, action_size, settings)
-    online = Networks(actor, critics, jnp.log(jnp.asarray(settings.temperature)))
+    online = Networks(actor, critics, jnp.log(jnp.float32(settings.temperature)))
     return SAC(
         online=online,
         target=copy_networks(critics),
@@ -82,7 +82,7 @@ def explore(actor: MLP, observation: Observation, noise: Action, settings: SACSe
 
 
 def sample(actor: MLP, observation: Observation, key: PRNGKeyArray) -> tuple[Action, PerStep]:
-    """Return sampled actions and their log pi: log normal density minus log slope of the tanh (appendix C, Eq. 21)."""
+    """Return sampled actions and their log pi: the log density of the normal distribution minus log(1 - tanh(u)^2)."""
     mean, log_std = _mean_and_log_std(actor, observation)
     noise = jax.random.normal(key, mean.shape)
     u = mean + jnp.exp(log_std) * noise
