@@ -195,7 +195,7 @@ def test_new_task_of_two_teams(command, tmp_path):
         assert f"lare-rl design {name} --model NAME" in out
     (prompted,) = re.findall(r"lare-rl prompt (\S+)", out)
     assert command("prompt", prompted)[0] == 0
-    assert "lists their files" in command("prompt", "CompetitivePP-6")[2]
+    assert "teams lists them" in command("prompt", "CompetitivePP-6")[2]
     (tmp_path / files[0]).unlink()
     for options, words in (((), "choose another folder"), (("--out", files[2]), "of a team")):
         assert words in command("new-task", "pettingzoo/mpe2.simple_adversary_v3:parallel_env", *options)[2]

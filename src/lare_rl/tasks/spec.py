@@ -297,6 +297,6 @@ def require_role(task: TaskSpec) -> TaskSpec:
     if task.teams:
         names = ", ".join(team.name for team in task.teams)
         raise LareError(
-            f"{task.name} has teams ({names}), each with its own latent function: give the task file of one team, which the key teams lists"
+            f"{task.name} has teams ({names}), each with its own latent function: give the task file of one team (the key teams lists them)"
         )
     return task
