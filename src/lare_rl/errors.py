@@ -174,7 +174,7 @@ def _describe(error: ValidationError, keys: Sequence[str]) -> str:
 
 def _path(problem: Mapping[str, Any]) -> str:
     """Return the key of a problem, such as `td3.gamma`, without the names that Pydantic gives to the alternatives of a union."""
-    return ".".join(str(part) for part in problem["loc"] if not _UNION_TAG.match(str(part)))
+    return ".".join(str(key) for key in problem["loc"] if not _UNION_TAG.match(str(key)))
 
 
 def _describe_problem(problem: Mapping[str, Any], keys: Sequence[str]) -> str:

@@ -128,8 +128,8 @@ def test_sampled_reward_of_a_team_is_the_mean_over_agents_that_are_alive(run, pl
 def test_payments_for_several_steps_are_no_step_rewards(run, played, monkeypatch):
     is_paid = np.arange(len(played.mask))[:, None, None] % 2 == 1  # every second step, as in the task
     timestep = played.steps.next_timestep._replace(reward=np.where(is_paid, played.reward, 0))
-    paid = replace(played, steps=played.steps._replace(next_timestep=timestep))
-    monkeypatch.setattr(module, "play_run", lambda *arguments, **options: paid)
+    bagged = replace(played, steps=played.steps._replace(next_timestep=timestep))
+    monkeypatch.setattr(module, "play_run", lambda *arguments, **options: bagged)
     (sample,) = sample_steps(run)
     assert not sample.has_step_rewards
 

@@ -142,8 +142,8 @@ class DecoderLearner:
     def _forget_since(self, step_id: int) -> None:
         """Abandon the episodes with this step or later ones, which are all pending."""
         forgotten = set(map(id, self.store.forget_since(step_id)))
-        kept = [[episode for episode in batch if id(episode) not in forgotten] for batch in self._pending_episodes]
-        self._pending_episodes = deque(filter(None, kept))
+        waiting = [[episode for episode in batch if id(episode) not in forgotten] for batch in self._pending_episodes]
+        self._pending_episodes = deque(filter(None, waiting))
         self._pending_returns = [episode for episode in self._pending_returns if id(episode) not in forgotten]
 
     def _fill_history(self, rows: Int[np.ndarray, " n"]) -> None:
