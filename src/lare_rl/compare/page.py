@@ -32,7 +32,7 @@ def write_comparisons(
     """Compare results (`compare_tasks`), and write the page, with the findings about the results at its end.
 
     Returns:
-        The comparisons, and the rows of the table over all tasks, under `OVERALL_HEADER`. It is empty if there is nothing to compare.
+        The comparisons, and the rows of the table over all tasks, under `OVERALL_HEADER`; no rows if `compare_over_tasks` has none.
 
     Raises `LareError` if the results cannot be compared, or the file cannot be written.
     """
@@ -42,17 +42,18 @@ def write_comparisons(
         for number, row in enumerate(compare_over_tasks(comparisons))
     ]
     tasks = ", ".join(task for comparison in comparisons for task in comparison.tasks)
-    title = f"{tasks}: {len({result.label for result in results})} methods"
+    n_labels = len({result.label for result in results})
+    title = f"{tasks}: {n_labels} method{'s' if n_labels > 1 else ''}"
     notes = [f"Note: {render(finding, MESSAGES)}" for finding in findings]
-    if origin := _find_origin(results):
-        notes.append(render(origin, MESSAGES))
+    if provenance := _find_provenance(results):
+        notes.append(render(provenance, MESSAGES))
     body = [f"<h1>{escape(title)}</h1>", *_body(comparisons, overall), *map(render_note, notes)]
     write_page(out, title, "\n".join(body))
     return comparisons, overall
 
 
 def describe(comparison: Comparison) -> str:
-    """Return what the scores are, and what few runs cannot show."""
+    """Return a paragraph: what the scores are, and which intervals and p-values so few runs make unreliable."""
     return to_text([find_score_meaning(comparison), *find_small_samples(comparison), *find_min_p(comparison)])
 
 
@@ -83,7 +84,7 @@ def _format_cell(value: Estimate | float | None) -> str:
     return str(value) if isinstance(value, Estimate) else f"{value:.2g}"
 
 
-def _find_origin(results: Sequence[LearningCurve]) -> Finding | None:
+def _find_provenance(results: Sequence[LearningCurve]) -> Finding | None:
     """Return the versions, machine and evaluations that all runs share."""
     configs = [result.config for result in results if result.config is not None]
     values = {name: {get_value(config) for config in configs} for name, get_value in ORIGINS.items()}
@@ -110,6 +111,7 @@ def _body(comparisons: Sequence[Comparison], overall: Sequence[tuple[str, ...]])
     if overall:
         yield "<h2>All tasks</h2>"
         yield render_table(OVERALL_HEADER, overall, range(1, len(OVERALL_HEADER)))
+        yield render_note(MESSAGES["over_tasks"])
     elif len(comparisons) > 1:
         yield render_note(MESSAGES["no_overall_table"])
     yield render_note(to_text([Finding("columns"), Finding("intervals", {"repetitions": REPETITIONS})]))
