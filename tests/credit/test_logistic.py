@@ -99,3 +99,16 @@ def test_equal_returns_and_the_window():
             rows = np.minimum(np.arange(18) + start, len(x) - 1)
             state = logistic.add_episodes(state, jnp.asarray(x[rows]), jnp.asarray(returns[rows]), chunk)
     assert sorted(np.asarray(state.columns)[:, 0]) == sorted(x[10:, 0].astype(np.float32))
+
+
+def test_a_window_of_wins_keeps_the_fit():
+    """A task that is solved does not lose its credit."""
+    x, _, returns = make_episodes(100)
+    state = fit(x, returns)
+    wins, _, _ = make_episodes(logistic.WINDOW, seed=1)
+    with float64():
+        won = logistic.add_episodes(state, jnp.asarray(wins), jnp.full(len(wins), 10.0), jnp.ones(len(wins), bool))
+        won = logistic.fit(won, GROUP_INDEX, ROUNDS)
+    np.testing.assert_array_equal(won.posterior.weight, state.posterior.weight)
+    assert logistic.to_returns(won)[1] > 0.5 * logistic.to_returns(state)[1] > 0
+    assert 0 < float(logistic.predict(won, jnp.asarray(wins[:1]))[0]) < 10

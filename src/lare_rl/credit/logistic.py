@@ -57,6 +57,9 @@ class LogOddsFit(NamedTuple):
     returns: Float[Array, " window"]
     n_episodes: Float[Array, ""]
     """The number of episodes that were ever added."""
+    lowest: Float[Array, ""]
+    highest: Float[Array, ""]
+    """The range of all returns so far, which is that of the score. The last episodes may all be won."""
     posterior: Posterior
     """In units of log odds."""
     root: Float[Array, "columns columns"]
@@ -66,7 +69,7 @@ class LogOddsFit(NamedTuple):
 def init(alpha_index: AlphaIndex) -> LogOddsFit:
     """Return the state without episodes."""
     n_columns = len(alpha_index)
-    empty = jnp.zeros((WINDOW, n_columns)), jnp.zeros(WINDOW), jnp.zeros(())
+    empty = jnp.zeros((WINDOW, n_columns)), jnp.zeros(WINDOW), *jnp.zeros(3)
     return LogOddsFit(*empty, evidence.init_posterior(alpha_index), root=jnp.zeros((n_columns, n_columns)))
 
 
@@ -83,18 +86,20 @@ def add_episodes(
 ) -> LogOddsFit:
     """Add new episodes, at most as many as the window has. Episodes where `mask` is false are ignored."""
     slot = ring_slots(state.n_episodes, mask, WINDOW)
-    return state._replace(
+    state = state._replace(
         columns=state.columns.at[slot].set(columns.astype(jnp.float32), mode="drop"),
         returns=state.returns.at[slot].set(returns.astype(jnp.float32), mode="drop"),
         n_episodes=state.n_episodes + jnp.sum(mask, dtype=jnp.float32),
     )
+    _, lowest, highest = _valid_range(state)
+    return state._replace(lowest=lowest, highest=highest)
 
 
 def _valid_range(state: LogOddsFit) -> tuple[Bool[Array, " window"], Float[Array, ""], Float[Array, ""]]:
-    """Return which slots have an episode, and the lowest and the highest return."""
-    valid = jnp.arange(WINDOW) < state.n_episodes
-    low = jnp.min(jnp.where(valid, state.returns, jnp.inf))
-    return valid, low, jnp.max(jnp.where(valid, state.returns, -jnp.inf))
+    """Return which slots have an episode, and the lowest and the highest return so far."""
+    valid, has_range = jnp.arange(WINDOW) < state.n_episodes, state.highest > state.lowest
+    low = jnp.min(state.returns, where=valid, initial=jnp.where(has_range, state.lowest, jnp.inf))
+    return valid, low, jnp.max(state.returns, where=valid, initial=jnp.where(has_range, state.highest, -jnp.inf))
 
 
 _State = tuple[Int[Array, ""], Float[Array, ""], Float[Array, " window"], Posterior, Float[Array, "columns columns"]]
@@ -104,12 +109,14 @@ _State = tuple[Int[Array, ""], Float[Array, ""], Float[Array, " window"], Poster
 def fit(state: LogOddsFit, alpha_index: AlphaIndex, max_rounds: int | Int[Array, ""]) -> LogOddsFit:
     """Fit to the episodes, from the precisions of the last fit. Call this with float64 enabled.
 
-    Returns are divided into won and lost halfway between the lowest and the highest. While all are equal, nothing changes.
+    Returns are divided into won and lost halfway between the lowest and the highest. While all episodes are won, or all are lost, nothing
+    changes.
     """
     valid, low, high = _valid_range(state)
     n_episodes = jnp.maximum(jnp.sum(valid), 1)
     x = jnp.where(valid[:, None], state.columns, 0).astype(float)
     won = (state.returns > (low + high) / 2).astype(float)
+    is_mixed = jnp.any(valid & (won > 0)) & jnp.any(valid & (won == 0))
     squares = jnp.sum(jnp.where(valid[:, None], x - jnp.sum(x, axis=0) / n_episodes, 0) ** 2, axis=0)
     is_used = varies(squares / n_episodes, jnp.sum(x**2) / (n_episodes * x.shape[1]))
     x = jnp.where(is_used, x, 0)
@@ -156,7 +163,7 @@ def fit(state: LogOddsFit, alpha_index: AlphaIndex, max_rounds: int | Int[Array,
     initial = jax.tree.map(lambda leaf: leaf.astype(float) if leaf.dtype == jnp.float32 else leaf, initial)
     *_, posterior, root = jax.lax.while_loop(is_unsettled, body, initial)
     fitted = state._replace(posterior=posterior, root=root)
-    return jax.tree.map(lambda new, old: jnp.where(high > low, new, old).astype(old.dtype), fitted, state)
+    return jax.tree.map(lambda new, old: jnp.where(is_mixed, new, old).astype(old.dtype), fitted, state)
 
 
 def predict(state: LogOddsFit, columns: Float[Array, "episodes columns"]) -> Float[Array, " episodes"]:

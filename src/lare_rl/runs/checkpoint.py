@@ -38,6 +38,7 @@ SAVED_BY_ROW = f"{REPLAY}columns"
 ZERO_IF_MISSING = (
     *(".closed_form.strengths.", ".closed_form.intercept", ".closed_form.start_value"),
     ".target_scale",
+    *(".log_odds.lowest", ".log_odds.highest"),
     *(".is_log_odds", ".is_average", ".predictions.level", ".score_type_predictions.level"),
 )
 """Paths of arrays that earlier checkpoints do not have. Zeros mean that they have not been computed yet, or make no difference."""

@@ -82,7 +82,7 @@ class CreditedTurns:
 
     @property
     def is_grpo(self) -> bool:
-        """Whether the values are not trusted, and the advantage is GRPO's: the outcome minus the mean of the group."""
+        """Whether the values are not trusted. All turns of a rollout then have the same advantage, as in GRPO: R - `group_means`."""
         return self.reason.code in UNTRUSTED
 
     @property

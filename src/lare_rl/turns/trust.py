@@ -2,14 +2,14 @@
 
 Two numbers compare the outcome R of each rollout with the values V of its prefixes that follow from all other rollouts:
 
-* the gain: the share of the squared error of the mean of the group, over all prefixes, that V removes. GRPO's baseline is this mean. The
-  gain has a standard error over rollouts.
+* the gain: the share of the squared error of `group_means`, over all prefixes, that V removes. It has a standard error over rollouts.
 * the surprise at the end: the mean of R - V before the last turns of agents that stopped by themselves. If it is large, then the values
   miss what agents see before they stop, and the last turn gets the credit of the turns before it. If it is negative, the last turn
   gets less than its due, which has done no harm on the testbeds.
 
 Lambda is 0.8 while both numbers allow it, and otherwise 0.95, which needs the values less. While it is not clear that the values are better
-than the mean of the group, lambda is 1 and the advantage is that of GRPO: the outcome minus the mean of the group.
+than `group_means`, lambda is 1, and all turns of a rollout have the same advantage, as in GRPO: R - `group_means`. GRPO's own baseline is
+the mean of the group with the rollout itself, which is not drawn towards the mean of all.
 """
 
 import math
@@ -109,7 +109,7 @@ def summarise(errors: Sequence[Errors]) -> Trust:
 
 def choose_lambda(trust: Trust) -> tuple[float, Finding]:
     """Return lambda, and the reason for it."""
-    values = trust._asdict() | {"decimals": max(0, count_decimals(trust.outcome_std) - 1)}
+    values = trust._asdict() | {"decimals": max(0, count_decimals(trust.outcome_std) - 1), "needed": MIN_ROLLOUTS}
     if math.isnan(trust.gain):
         return GRPO, Finding("unknown", values)
     if trust.gain <= CLEAR_ERRORS * trust.gain_error:

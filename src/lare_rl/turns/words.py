@@ -6,11 +6,14 @@ __all__ = ["MESSAGES", "count_decimals"]
 
 MESSAGES = {
     "lambda": "Lambda {lambda_:g} was used: {reason}.",
-    "grpo": "The advantage is the outcome minus the mean of its group, as in GRPO: {reason}.",
+    "grpo": (
+        "All turns of a rollout have the same advantage, as in GRPO: the outcome minus the mean of the group's other rollouts, drawn "
+        "towards the mean of all. The reason: {reason}."
+    ),
     "chosen": "it was set by the caller. The measurement says: {measured}",
     "unknown": (
-        "the outcomes of {n_rollouts:count rollout} have a standard deviation of {outcome_std:.2g}, which says nothing "
-        "about the values"
+        "{n_rollouts:count rollout}, whose outcomes have a standard deviation of {outcome_std:.2g}, say nothing about the values; at "
+        "least {needed} are needed, and outcomes that differ"
     ),
     "unclear_gain": (
         "it is not clear that values of prefixes predict outcomes better than the group's mean (gain {gain:.1%} ± "
