@@ -115,6 +115,16 @@ def test_factors_that_explain_nothing():
     assert not result.explains_mean_reward  # all episodes have the same length
 
 
+def test_a_factor_of_equal_means_varies_by_its_shapes():
+    u, length = sample_inputs(120)
+    index = np.repeat(np.arange(len(length)), length)
+    u[:, 0] *= np.random.default_rng(1).uniform(0.2, 2, size=len(length))[index]
+    u[:, 0] -= (np.bincount(index, u[:, 0]) / length)[index]
+    result = explain_rewards(EXTENDED, u, length, -(u[:, 0] ** 2))
+    assert result.factor_varies.tolist() == [True, True]
+    assert result.factor_shares[0] > 0.9
+
+
 def test_sum_of_shares_few_episodes_and_equal_factors():
     for noise in (0.1, 3.0):
         result = explain_function(EXTENDED, [2.0, -1.0, 0.5, 1.0, 0], count=30, noise=noise)

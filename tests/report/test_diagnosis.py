@@ -46,7 +46,7 @@ def find(returns, **facts):
         # Two standard errors of a difference are 17. They would be 22.6 with an error of 8, and the end is lower by 19.75.
         (
             FELL_A_LITTLE,
-            {"episode_error": 6.0, "episodic": EpisodicRun(26.0, 1)},
+            {"episode_error": 6.0, "episodic": EpisodicRun(26.0, 1, None, 6.0)},
             "learned like_episodic has_fallen single_seed",
         ),
         (FELL_A_LITTLE, {"episode_error": 8.0}, "learned single_seed"),

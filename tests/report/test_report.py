@@ -184,7 +184,10 @@ def test_summary_of_runs(make_run):
         ReportedRun(f"{method} {value}", make_run(f"{method} {value}", [value, value + 1], method=method))
         for method, value in [("rd", 9.0), ("episodic", 1.0), ("episodic", 3.0)]
     )
-    for runs, reference in (([first, second], (1.5, 2, None)), ([first, second, third], (3.5, 2, third.name))):
+    for runs, reference in (
+        ([first, second], (1.5, 2, None, 0.5)),
+        ([first, second, third], (3.5, 2, third.name, 0.5)),
+    ):
         summaries = summarise_runs(runs, np.zeros((1, 0)))
         assert [summary.episodic for summary in summaries] == [reference] + [None] * (len(runs) - 1)
     assert first.training_seconds() is None

@@ -238,9 +238,10 @@ def level_returns(
 
 
 def start_value(state: DecoderState) -> Float[Array, ""]:
-    """Return the start value of a score that is a sum, or 0."""
-    is_sum = ~(state.is_average | state.is_log_odds)
-    return jnp.zeros(()) if state.closed_form is None else jnp.where(is_sum, state.closed_form.start_value[0], 0)
+    """Return the start value of a score that is a sum, or 0. A fit of prefixes has V_0 instead, which is not the start value of R."""
+    if state.closed_form is None or state.closed_form.decoder.basis.prefixes:
+        return jnp.zeros(())
+    return jnp.where(state.is_average | state.is_log_odds, 0, state.closed_form.start_value[0])
 
 
 def level_effects(state: DecoderState, mean_length: float, n_levels: int) -> Float[Array, " levels"]:

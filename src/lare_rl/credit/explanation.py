@@ -53,6 +53,8 @@ __all__ = ["Explanation", "ExplanationState", "add_to_explanation", "explain", "
 
 MAX_EXPLANATION_ROUNDS = 100
 """The maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
+USED_SHARE = 0.05
+"""A raw feature that explains more than this share of the variation is used, be it by its pairs alone."""
 MIN_MEAN_STD = 1e-5
 """The means of a standardised factor over episodes vary by more than rounding if their standard deviation exceeds this."""
 MIN_SAME = 1 - 2e-6
@@ -95,7 +97,7 @@ class Explanation(NamedTuple):
     factors_r2: Float[AnyArray, ""] = np.zeros(())
     """R^2 of the factors alone, with their shapes and pairs."""
     factor_varies: Bool[AnyArray, " factors"] = _NO_FACTORS > 0
-    """Whether a factor's mean differs between episodes by more than rounding."""
+    """Whether the mean of a factor, of its shapes or of its pairs differs between episodes by more than rounding."""
     factor_shares: Float[AnyArray, " factors"] = _NO_FACTORS
     """The share of the variation that each factor explains, with its shapes and half of its pairs. It is negative if the factor offsets
     others. The shares add up to `factors_r2`."""
@@ -148,14 +150,15 @@ def explain(
     is_factor = basis.is_factor_feature
     full = _fit(statistics, score_type, basis.group_index, basis.strength_index)
     raw_single, raw_pairs = _input_shares(full.feature_shares[~is_factor], basis.n_raw_used, basis.raw_frequencies)
+    raw_shares = raw_single + raw_pairs
     mean_length = statistics.n_steps / jnp.maximum(statistics.n_episodes, 1)
     explanation = Explanation(
         n_episodes=statistics.n_episodes,
         mean_length=mean_length,
         explains_mean_reward=explains_mean_reward,
         total_r2=full.r2,
-        raw_feature_used=_is_used(full, basis),
-        raw_feature_shares=raw_single + raw_pairs,
+        raw_feature_used=_is_used(full, basis) | (raw_shares > USED_SHARE),  # the latter also by its pairs
+        raw_feature_shares=raw_shares,
         residual_correlation=jnp.zeros(basis.n_raw_used),
     )
     if not is_factor.any():
@@ -169,11 +172,12 @@ def explain(
     slope, slope_covariance, linear_share = _slopes(
         factors.posterior.weight + lines @ factors.posterior.weight, root.T @ root, state
     )
+    varies = jnp.diagonal(factors.problem.s) > MIN_MEAN_STD**2 * statistics.n_steps
     divisor = jnp.where(score_type == ScoreType.AVERAGE, mean_length, 1)  # r_hat of an average is divided by T
     return explanation._replace(
         total_r2=jnp.maximum(full.r2, factors.r2),
         factors_r2=factors.r2,
-        factor_varies=jnp.diagonal(factors.problem.s)[: basis.n_factors] > MIN_MEAN_STD**2 * statistics.n_steps,
+        factor_varies=sum(_input_shares(varies.astype(float), basis.n_factors, basis.factor_frequencies)) > 0,
         factor_shares=single + pairs,
         pair_shares=pairs,
         slope=slope / divisor,

@@ -106,8 +106,8 @@ def assess_factors(
             lengths_alone = np.where(column == n_features, columns, 0)
             length_r2 = r_squared(later_returns, predict(lengths_alone, score_type=score_type)[0])[0]
         if level is not None:
-            levels_alone = np.where(column >= n_features, columns, 0)
-            level_r2 = r_squared(later_returns, predict(levels_alone, score_type=score_type)[0])[0]
+            levels_alone = np.where(column > n_features, columns, 0)  # an average, because a sum would know the lengths
+            level_r2 = r_squared(later_returns, predict(levels_alone, score_type=ScoreType.AVERAGE)[0])[0]
         start_value = length.mean() * weight[basis.n_factor_features]
         explained = jax.tree.map(np.asarray, _explain(state, score_type, start_value))
     r2, r2_error = r_squared(later_returns, predicted)

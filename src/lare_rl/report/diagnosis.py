@@ -4,6 +4,7 @@ A rule is a function from the summary of a run to a finding or None, named by it
 group reports the finding of its first rule that has one. The sentences are in `messages.py`.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -11,14 +12,12 @@ import numpy as np
 
 from lare_rl.credit.basis import MAX_PAIRED_RAW_FEATURES
 from lare_rl.credit.prequential import LITTLE_R2
-from lare_rl.report.run_summary import MIN_EVALUATIONS, MIN_SEEDS, RunSummary
+from lare_rl.report.run_summary import CLOSE_CORRELATION, MIN_EVALUATIONS, MIN_SEEDS, RunSummary
 from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import CLEAR_ERRORS, sample_std
 
 __all__ = ["Subject", "diagnose"]
 
-CLOSE_CORRELATION = 0.99
-"""Proxy and true rewards of steps agree if their correlation is higher."""
 BAD_R2 = -1.0
 """Proxy rewards predict returns much worse than their mean if R^2 of the returns is lower."""
 HIGH_R2 = 0.8
@@ -101,11 +100,11 @@ def _deterministic(run: RunSummary) -> Finding | None:
 
 
 def _episodic_comparison(run: RunSummary) -> Finding | None:
-    """Compare with training on the return of the episode alone. The two returns count as equally uncertain."""
+    """Compare with training on the return of the episode alone."""
     if run.episodic is None:
         return None
-    return_, n_seeds, name = run.episodic
-    difference, bound = run.final_return - return_, CLEAR_ERRORS * run.final_difference_error
+    return_, n_seeds, name, error = run.episodic
+    difference, bound = run.final_return - return_, CLEAR_ERRORS * math.hypot(run.final_error, error)
     code = "like_episodic" if abs(difference) <= bound else "above_episodic" if difference > 0 else "below_episodic"
     best = None if name is None else Finding("best_episodic", {"name": name})
     few_seeds = Finding("so_few_seeds") if min(run.n_seeds, n_seeds) < MIN_SEEDS else None
@@ -116,8 +115,8 @@ def _proxy_rewards(run: RunSummary) -> Finding | None:
     """Report how much of the score the proxy rewards explain."""
     if run.return_r2 is None:
         return None
-    is_outdated = run.return_r2 < LITTLE_R2 and not run.explains_little
-    r2 = run.median_r2 if is_outdated and run.median_r2 is not None else run.return_r2
+    is_outdated = run.median_r2 is not None and run.return_r2 < LITTLE_R2 <= run.median_r2
+    r2 = run.median_r2 if is_outdated else run.return_r2
     inputs = "raw_features" if not run.sees_factors else "all_inputs" if run.sees_raw_features else "factors"
     values = {
         "inputs": Finding(inputs),

@@ -14,7 +14,7 @@ from lare_rl.report.diagnosis import diagnose
 from lare_rl.report.html import render_figures, render_fold, render_note, render_table, render_tiles
 from lare_rl.report.messages import MESSAGES, WORDS
 from lare_rl.report.reported_run import Curve, ReportedRun, finite, mean_over_seeds
-from lare_rl.report.run_summary import MIN_SEEDS, EpisodicRun, RunSummary, summarise_run
+from lare_rl.report.run_summary import MIN_SEEDS, EpisodicRun, RunSummary, find_final_error, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding, format_for_reader, format_number, render
@@ -69,7 +69,8 @@ def summarise_runs(
     episodic = None
     if episodic_runs := _episodic_runs(runs):
         best, name = episodic_runs[0], episodic_runs[0].name if len(episodic_runs) > 1 else None
-        episodic = EpisodicRun(best.final_return, len(best.final_values(RETURN)), name)
+        error = find_final_error(best, random_returns[0])
+        episodic = EpisodicRun(best.final_return, len(best.final_values(RETURN)), name, error)
     return [summarise_run(run, random_returns[0], None if run.is_episodic else episodic) for run in runs]
 
 

@@ -29,12 +29,14 @@ from lare_rl.training.advice import describe_untrained
 from lare_rl.util.statistics import CLEAR_ERRORS, episode_error, grouped_standard_error, sample_std, standard_error
 
 __all__ = [
+    "CLOSE_CORRELATION",
     "MIN_EVALUATIONS",
     "MIN_SEEDS",
     "POSSIBLE_ERRORS",
     "SEED_STDS",
     "EpisodicRun",
     "RunSummary",
+    "find_final_error",
     "summarise_run",
 ]
 
@@ -42,6 +44,8 @@ POSSIBLE_ERRORS = 1
 """A difference is possible if it exceeds this number of its standard errors."""
 SEED_STDS = 2
 """A seed has learned if its final return exceeds the mean of random actions by this number of deviations of their returns."""
+CLOSE_CORRELATION = 0.99
+"""Proxy and true rewards of single steps agree if their correlation exceeds this."""
 MIN_ERROR = 1e-9
 """The smallest standard error. With it, equal returns do not differ."""
 MIN_EVALUATIONS = 5
@@ -57,6 +61,8 @@ class EpisodicRun(NamedTuple):
     n_seeds: int
     name: str | None = None
     """Its name, if it is the best of several."""
+    final_error: float = 0.0
+    """The standard error of the final return, as in `RunSummary.final_error`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,13 +223,15 @@ class RunSummary:
 
     @cached_property
     def trend(self) -> tuple[float, float, float] | None:
-        """The means of the last two quarters (n // 4) of the n `finite_means`, and the typical change from one evaluation to the next.
+        """The means of the last two quarters of the `finite_means`, and the typical change from one evaluation to the next.
+
+        A quarter has two evaluations or more.
 
         None if there are too few evaluations with a return.
         """
         if len(self.finite_means) < MIN_EVALUATIONS:
             return None
-        n_quarter = len(self.finite_means) // 4
+        n_quarter = max(2, len(self.finite_means) // 4)
         half = self.finite_means[-2 * n_quarter :]
         change = np.median(np.abs(np.diff(half)))
         return float(half[:n_quarter].mean()), float(half[n_quarter:].mean()), float(change)
@@ -236,6 +244,8 @@ class RunSummary:
         """
         if self.score_use is not None and self.score_use.is_binary:
             return math.isfinite(self.score_use.gain) and not self.score_use.is_clear
+        if self.credit_correlation is not None and self.credit_correlation > CLOSE_CORRELATION:
+            return False  # returns that hardly differ have a low R^2 however good the credit is
         r2s = [r2 for r2 in (self.return_r2, self.median_r2) if r2 is not None]
         return self.return_r2 is not None and max(r2s) < LITTLE_R2
 
@@ -285,6 +295,11 @@ def summarise_run(
         has_best_policy=len(task.roles) == 1,
         task=task.name if task.name in shipped_tasks() else "TASK.toml",
     )
+
+
+def find_final_error(reported: ReportedRun, random_returns: Float[np.ndarray, " episodes"]) -> float:
+    """Return the standard error of a run's final return, as in `RunSummary.final_error`."""
+    return grouped_standard_error(reported.final_values(RETURN), _episode_error(reported, random_returns))
 
 
 def _episode_error(reported: ReportedRun, random_returns: Float[np.ndarray, " episodes"]) -> float:
