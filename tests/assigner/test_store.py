@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lare_rl.assigner.store import Store
+from lare_rl.assigner.store import MAX_MISMATCHES, Store
 from lare_rl.errors import LareError
 from lare_rl.tasks.payments import PaymentRule
 
@@ -77,6 +77,19 @@ def test_lengths_of_a_running_episode_is_the_mean():
         store.end(0, 1.0)
     store.add(1)
     assert store.lengths(np.arange(10)).tolist() == [3] * 3 + [6] * 6 + [4]
+
+
+def test_steps_that_never_continue_their_episode_are_warned_of():
+    store, row = Store(50, (1,)), np.zeros((1, 1), np.float32)
+    for i in range(MAX_MISMATCHES):  # every other step continues
+        list(store.extend(["a"], store.add(1), [row + i // 2, row, row + (i + 1) // 2], np.zeros(1), *NOT_ENDED))
+
+    def add_noisy_steps():
+        for _ in range(MAX_MISMATCHES + 1):
+            list(store.extend(["b"], store.add(1), [row, row, row + 1e-6], np.zeros(1), *NOT_ENDED))
+
+    with pytest.warns(RuntimeWarning, match="another observation than the next_observation"):
+        add_noisy_steps()
 
 
 def test_lengths_of_a_long_running_episode_is_its_steps_since_the_last_payment():

@@ -17,6 +17,7 @@ from lare_rl.envs.episodic import TRUE_REWARD
 from lare_rl.errors import LareError
 from lare_rl.integrations.gymnasium import Credit, VectorCredit
 from lare_rl.integrations.recorder import CREDIT_STEP, check_assigner, check_pay
+from lare_rl.tasks.payments import PaymentRule
 
 SPACES = {
     "box": (None, None),
@@ -214,7 +215,12 @@ class WholeRewards(VectorWrapper):
 
     def step(self, actions):
         observation, reward, *flags, infos = self.env.step(actions)
-        return observation, reward.astype(int), *flags, infos | {"time": 0.1}
+        return (
+            observation,
+            reward.astype(int),
+            *flags,
+            infos | {"time": 0.1, "log": np.zeros(0), "names": [[1], [2, 3]]},
+        )
 
 
 def test_whole_rewards_and_infos_of_all_environments():
@@ -229,6 +235,11 @@ class WithoutFinalObs(VectorWrapper):
         return *results, {name: value for name, value in infos.items() if name != "final_obs"}
 
 
+def play_once(env, action):
+    env.reset()
+    env.step(action)
+
+
 def small_assigner(**changes):
     return RecordingAssigner("ircr", **({"observation_space": 2, "action_space": 1} | changes))
 
@@ -239,6 +250,11 @@ def small_assigner(**changes):
         (lambda: check_assigner("bayes"), "CreditAssigner.*'bayes'"),
         (lambda: Credit(RandomEnv(), small_assigner(agents=2, max_steps=5)), "agents=2.* has 1"),
         (lambda: check_pay("all"), "pay = 'all'"),
+        (
+            lambda: Credit(RandomEnv(), small_assigner(payments=PaymentRule(period=2)), score="s"),
+            "'s' is the score of an",
+        ),
+        (lambda: play_once(Credit(RandomEnv(), small_assigner()), "right"), "the action is 'right'"),
         (lambda: Credit(RandomEnv(), small_assigner(observation_space=3)), "observations .* 2 numbers.* 3"),
         (lambda: VectorCredit(make_vector()[0], small_assigner(action_space=4)), "actions .* 1 numbers.* 4"),
         (

@@ -78,6 +78,24 @@ def test_steps(presence):
     assert credit.store.dropped == credit.n_fits == 0
 
 
+class LenientTeam(LoggedTeam):
+    """Ignores actions for agents that have left."""
+
+    def step(self, actions):
+        return super().step({agent: actions[agent] for agent in self.agents})
+
+
+def test_actions_of_agents_that_have_left_do_not_count():
+    team, credit = LenientTeam(NAMES, leaves={"a_1": 2}), make_assigner()
+    wrapped = CreditParallel(team, credit, pay="environment")
+    wrapped.reset(seed=0)
+    while wrapped.agents:
+        wrapped.step(dict.fromkeys(NAMES, 0))
+    present = [[name in step for name in NAMES] for step in team.log]
+    assert credit.store.alive[: len(present)].tolist() == present
+    assert not all(map(all, present))
+
+
 def test_rewards():
     team, credit = LoggedTeam(NAMES, leaves={"a_1": 2}), make_assigner("rd-linear")
     wrapped = CreditParallel(team, credit)

@@ -221,7 +221,10 @@ class CreditAssigner:
             self.learner.queue_episodes([self.store.end(arguments.to_env_id(env_id), score)])
 
     def drop(self, env_id: Any) -> None:
-        """Abandon the episode of an environment: it is never learned from. Its steps still have proxy rewards."""
+        """Abandon the episode of an environment, which is reset: it is never learned from. Its steps still have proxy rewards.
+
+        Call it only when the environment is reset. Steps of the same episode that follow would be a new one.
+        """
         with self.lock:
             self.store.drop(arguments.to_env_id(env_id))
 

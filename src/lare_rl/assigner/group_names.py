@@ -14,7 +14,7 @@ GroupName = str | int | float
 
 def to_group_name(value: Any, name: str = "a group") -> GroupName:
     """Return a text or a number as Python's own. Raises `LareError` for anything else, which `name` describes."""
-    group = value.item() if isinstance(value, np.generic | np.ndarray) and value.size == 1 else value
+    group = value.item() if hasattr(value, "item") and np.size(value) == 1 else value  # of NumPy, JAX or PyTorch
     if not isinstance(group, GroupName) or group != group:  # NaN
         raise LareError(f"{name} must be a text or a number, and is {short_repr(value)}")
     return group

@@ -7,6 +7,7 @@ are stored as an episode of their own.
 """
 
 import heapq
+import warnings
 from array import array
 from collections.abc import Hashable, Iterable, Iterator, MutableSequence, Sequence
 from dataclasses import dataclass, field
@@ -21,6 +22,9 @@ from lare_rl.errors import LareError
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule, is_paid
 
 __all__ = ["RunningEpisode", "Store", "StoredEpisode"]
+
+MAX_MISMATCHES = 10
+"""So many steps that do not continue their episodes are no resets: they are warned of."""
 
 
 class StoredEpisode(NamedTuple):
@@ -106,6 +110,8 @@ class Store:
         """The running episodes by environment. The environment whose last step is the oldest comes first."""
         self.dropped = 0
         """Abandoned episodes and refused payments."""
+        self.n_mismatches = 0
+        """The number of last steps that began at another observation than the one after the step before, which did so, too."""
 
     @property
     def bytes_per_step(self) -> int:
@@ -271,8 +277,18 @@ class Store:
         new one begins.
         """
         last = self.running[env_id].last_observation if env_id in self.running else None
-        if last is not None and not np.array_equal(last, observation):
+        if last is not None and np.array_equal(last, observation):
+            self.n_mismatches = 0
+        elif last is not None:
+            self.n_mismatches += len(self.running[env_id].step_ids) == 1
             self.drop(env_id)
+            if self.n_mismatches == MAX_MISMATCHES:
+                warnings.warn(
+                    f"{MAX_MISMATCHES} steps in a row begin at another observation than the next_observation of the step before, so their "
+                    "episodes are abandoned: give the environment's own observations, unchanged",
+                    RuntimeWarning,
+                    stacklevel=3,
+                )
         episode = self.running.pop(env_id, None) or RunningEpisode()
         self.running[env_id] = episode  # now the last of all environments
         return episode

@@ -19,6 +19,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from jaxtyping import Bool, Float
 
+from lare_rl.assigner.arguments import to_score
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.envs.episodic import TRUE_REWARD, read_score
 from lare_rl.errors import LareError, short_repr
@@ -46,12 +47,13 @@ class Credit(gymnasium.Wrapper, RecordConstructorArgs):
             pay: the reward that `step` returns. With "proxy" the decoder is fitted as steps come in.
             score: the key of the last step's `info` with the score of the episode. The default is the sum of the rewards.
 
-        Raises `LareError` if the assigner was made for other spaces, or for many agents.
+        Raises `LareError` if the assigner was made for other spaces, for many agents, or, with a `score`, for payments before the end.
         """
         # A copy of the assigner would learn from this environment alone.
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, credit=credit, pay=pay, score=score)
         gymnasium.Wrapper.__init__(self, env)
         check_pay(pay)
+        _check_score(credit, score)
         self.credit, self.pay, self.score = credit, pay, score
         self._recorder = StepRecorder(credit, env.observation_space, env.action_space, env_ids=[object()])
         self._observation: Any = None
@@ -64,20 +66,20 @@ class Credit(gymnasium.Wrapper, RecordConstructorArgs):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(deepcopy(action))  # it may write into it
-        credit_reward = float(reward)
+        true_reward = credit_reward = to_score(reward, "the reward")
         if self.score is not None:
             credit_reward = read_score(info, self.score) if terminated or truncated else 0.0
         steps = self._recorder.add(
-            batch_of_one(self.env.observation_space, self._observation),
-            batch_of_one(self.env.action_space, action),
-            batch_of_one(self.env.observation_space, observation),
+            batch_of_one(self.env.observation_space, self._observation, "the observation"),
+            batch_of_one(self.env.action_space, action, "the action"),
+            batch_of_one(self.env.observation_space, observation, "the observation"),
             [credit_reward],
             [terminated],
             [truncated],
             infos=[info],
         )
         self._observation = deepcopy(observation)
-        info = {TRUE_REWARD: float(reward), **info, CREDIT_STEP: int(steps[0])}
+        info = {TRUE_REWARD: true_reward, **info, CREDIT_STEP: int(steps[0])}
         if self.pay == "proxy":
             reward = float(self._recorder.proxy_rewards(steps)[0])
         return observation, reward, terminated, truncated, info
@@ -103,6 +105,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
             raise LareError(
                 f"the vector environment has metadata['autoreset_mode'] = {short_repr(self.mode)}: it must be an AutoresetMode"
             )
+        _check_score(credit, score)
         self.credit, self.pay, self.score = credit, pay, score
         self._recorder = StepRecorder(
             credit, env.single_observation_space, env.single_action_space, [object() for _ in range(env.num_envs)]
@@ -171,7 +174,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         return concatenate(space, rows, create_empty_array(space, self.num_envs))
 
     def _select_info(self, infos: Mapping[str, Any], done: Bool[np.ndarray, " envs"], env_index: Any) -> dict[str, Any]:
-        """Return the `info` of the last step of one environment."""
+        """Return the `info` of the last step of one environment. Only the score and the group have their values."""
         if self.mode == AutoresetMode.SAME_STEP and done[env_index]:
             infos = infos.get("final_info", infos)
 
@@ -179,7 +182,12 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
             mask = infos.get(f"_{name}")  # of the environments with `name`
             return name[:1] != "_" and (mask is None or bool(mask[env_index]))
 
-        return {name: _select_env(value, env_index) for name, value in infos.items() if has(name)}
+        names_read = self.score, self.credit.config.group_key
+        return {
+            name: _select_env(value, env_index) if name in names_read else None
+            for name, value in infos.items()
+            if has(name)
+        }
 
     def _true_reward(self, infos: Mapping[str, Any], reward: Any) -> Float[np.ndarray, " envs"]:
         """Return the environments' rewards. If an inner wrapper has replaced them, it reports them in `infos`."""
@@ -190,9 +198,20 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         return true_reward
 
 
-def batch_of_one(space: gymnasium.Space, element: Any) -> Any:
-    """Return a batch with one element of a space, as in a vector environment."""
-    return concatenate(space, [element], create_empty_array(space, 1))
+def _check_score(credit: CreditAssigner, score: str | None) -> None:
+    """Raise `LareError` if the score of an episode would be taken for its last payment."""
+    if score is not None and not credit.config.payments.only_at_end:
+        raise LareError(
+            f"score = {score!r} is the score of an episode, and the assigner was made for payments before the end"
+        )
+
+
+def batch_of_one(space: gymnasium.Space, element: Any, name: str) -> Any:
+    """Return a batch with one element of a space, as in a vector environment. Raises `LareError`, with the name, for another value."""
+    try:
+        return concatenate(space, [element], create_empty_array(space, 1))
+    except (TypeError, ValueError, KeyError) as error:
+        raise LareError(f"{name} is {short_repr(element)}, which is not in {space}: {error}") from error
 
 
 def _select_env(batch: Any, env_index: Any) -> Any:

@@ -80,7 +80,8 @@ class CreditParallel(BaseParallelWrapper):
         """Step the environment. Raises `LareError` if no episode is running."""
         if not self._running:
             raise LareError("no episode is running: call reset before step")
-        acting = {agent: index for index, agent in enumerate(self.team) if agent in actions}
+        present = set(self.env.agents) - self._left  # some loops also choose actions for agents that have left
+        acting = {agent: index for index, agent in enumerate(self.team) if agent in actions and agent in present}
         action = self._replace_rows(self._no_action, "action", actions)
         observations, rewards, terminated, truncated, infos = self.env.step(deepcopy(actions))
         next_observation = self._replace_rows(self._observation, "observation", observations)
@@ -118,7 +119,7 @@ class CreditParallel(BaseParallelWrapper):
         for index, agent in enumerate(self.team):
             if agent in values:
                 space = getattr(self.env, f"{kind}_space")(agent)
-                rows[index] = layout.rows(batch_of_one(space, values[agent]), kind)[0]
+                rows[index] = layout.rows(batch_of_one(space, values[agent], f"the {kind} of {agent}"), kind)[0]
         return rows
 
     def _to_batch(

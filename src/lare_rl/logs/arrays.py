@@ -47,7 +47,10 @@ class NpzLog(ArrayLog):
     """Files in the order of their names. Arrays with other names than those of `parse_episode` are copied unchanged."""
 
     def __init__(self, directory: Path, role: TaskSpec | None):
-        self.name, self.files = str(directory), sorted(directory.glob("*.npz"))
+        self.name, self.files = (
+            str(directory),
+            sorted(path for path in directory.glob("*.npz") if not path.name.startswith(".")),
+        )
         if not self.files:
             raise LareError(f"{directory} holds no .npz and no .parquet files")
         self.n_episodes = len(self.files)

@@ -85,7 +85,8 @@ class ParquetLog(TableLog):
     """A Parquet file, or a directory of files with the same columns, in the order of their names. The output is one file."""
 
     def read_batches(self) -> Iterator[pa.RecordBatch]:
-        files = sorted(self.path.glob("*.parquet")) if self.path.is_dir() else [self.path]
+        files = [path for path in sorted(self.path.glob("*.parquet")) if not path.name.startswith(".")]
+        files = files if self.path.is_dir() else [self.path]
         schema = None
         for file in files:
             try:
