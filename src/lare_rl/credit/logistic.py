@@ -69,8 +69,15 @@ class LogOddsFit(NamedTuple):
 def init(alpha_index: AlphaIndex) -> LogOddsFit:
     """Return the state without episodes."""
     n_columns = len(alpha_index)
-    empty = jnp.zeros((WINDOW, n_columns)), jnp.zeros(WINDOW), *jnp.zeros(3)
-    return LogOddsFit(*empty, evidence.init_posterior(alpha_index), root=jnp.zeros((n_columns, n_columns)))
+    return LogOddsFit(
+        columns=jnp.zeros((WINDOW, n_columns)),
+        returns=jnp.zeros(WINDOW),
+        n_episodes=jnp.zeros(()),
+        lowest=jnp.zeros(()),
+        highest=jnp.zeros(()),
+        posterior=evidence.init_posterior(alpha_index),
+        root=jnp.zeros((n_columns, n_columns)),
+    )
 
 
 def remove_episodes(state: LogOddsFit) -> LogOddsFit:

@@ -115,8 +115,9 @@ def _proxy_rewards(run: RunSummary) -> Finding | None:
     """Report how much of the score the proxy rewards explain."""
     if run.return_r2 is None:
         return None
-    is_outdated = run.median_r2 is not None and run.return_r2 < LITTLE_R2 <= run.median_r2
-    r2 = run.median_r2 if is_outdated else run.return_r2
+    median_r2 = run.return_r2 if run.median_r2 is None else run.median_r2
+    is_outdated = run.return_r2 < LITTLE_R2 <= median_r2
+    r2 = median_r2 if is_outdated else run.return_r2
     inputs = "raw_features" if not run.sees_factors else "all_inputs" if run.sees_raw_features else "factors"
     values = {
         "inputs": Finding(inputs),
