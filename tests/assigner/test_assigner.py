@@ -275,6 +275,7 @@ def test_step_with_an_infinite_factor_costs_only_the_episodes_that_wait(chase, t
     with pytest.raises(LareError, match=r"factor_1. is inf"):
         credit.rewards_at(bad)
     np.testing.assert_array_equal(credit.store.inputs[bad], 0)
+    credit.add([[0.0, 0.0]], [[0.0]], [[0.0, 0.0]], [7.0], [True], [False])  # the rest of an episode that waited
     numbers = credit.add_episode(*(np.minimum(array, 0) for array in third))
     credit.fit()
     assert np.isfinite(credit.rewards_at(numbers)).all()

@@ -51,6 +51,8 @@ class RunningEpisode:
     """The sum of its rewards since the last payment."""
     last_observation: Float[np.ndarray, "*agents observation"] | None = None
     """The observation after its last step."""
+    is_abandoned: bool = False
+    """Whether nothing is learned from it, because some of its steps have no inputs."""
 
 
 _Step = tuple[RunningEpisode, int, float, bool]
@@ -190,6 +192,8 @@ class Store:
                 self.previous[step_id % self.capacity] = episode.step_ids[-1]
             episode.step_ids.append(step_id)
             episode.return_ += reward
+            if episode.is_abandoned:
+                continue
             if is_paid(payments, len(episode.step_ids) - 1, np.array([reward]), ended):
                 try:
                     payment = self._pay(episode, episode.return_, payments.window)
@@ -218,6 +222,10 @@ class Store:
         if self.has_levels and self.running[env_id].level < 0:
             raise LareError(f"the episode of the environment {env_id!r} has no group: give group= at a step of it")
         episode = self.running.pop(env_id)
+        if episode.is_abandoned:
+            raise LareError(
+                f"the episode of the environment {env_id!r} was abandoned, because a factor of phi was not finite"
+            )
         if len(episode.step_ids) == episode.n_paid:
             self.dropped += 1
             raise LareError(
@@ -295,12 +303,15 @@ class Store:
 
     def drop(self, env_id: Hashable) -> None:
         """Abandon the running episode of an environment. Its steps stay stored, and are never learned from."""
-        self.dropped += self.running.pop(env_id, None) is not None
+        episode = self.running.pop(env_id, None)
+        self.dropped += episode is not None and not episode.is_abandoned
 
     def forget_since(self, step_id: int) -> list[StoredEpisode]:
-        """Abandon the episodes that have this step or later ones. Return those of them that had ended."""
-        for env_id in [key for key, episode in self.running.items() if episode.step_ids[-1] >= step_id]:
-            self.drop(env_id)
+        """Abandon the episodes that have this step or later ones, with what follows. Return those of them that had ended."""
+        for episode in self.running.values():
+            if episode.step_ids[-1] >= step_id and not episode.is_abandoned:
+                episode.is_abandoned = True
+                self.dropped += 1
         numbers = [number for number, episode in self.episodes.items() if episode.step_ids[-1] >= step_id]
         self.dropped += len(numbers)
         forgotten = [self.episodes.pop(number) for number in numbers]
