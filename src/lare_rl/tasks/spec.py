@@ -66,7 +66,7 @@ MAX_LEVELS = 64
 NO_ENVIRONMENT = "none"
 """The value of `environment` for a task with logs only, whose environment is not available."""
 
-OWN_METRICS = frozenset({"return", "return_std", "deterministic_return", "summed_return", "length"})
+RESERVED_METRICS = frozenset({"return", "return_std", "deterministic_return", "summed_return", "length"})
 """Names of an evaluation's own metrics, which no measure may have."""
 
 FILL_IN = "FILL IN"
@@ -163,18 +163,18 @@ class TaskSpec(CheckedModel):
     def _check_measures(cls, measures: tuple[str, ...]) -> tuple[str, ...]:
         if len(set(measures)) < len(measures):
             raise ValueError("the same key is listed twice.")
-        if reserved := sorted(OWN_METRICS.intersection(measures)):
+        if reserved := sorted(RESERVED_METRICS.intersection(measures)):
             raise ValueError(f"{reserved[0]!r} is a metric of every evaluation. Give the key of info another name.")
         return measures
 
     @model_validator(mode="after")
     def _check_teams(self) -> "TaskSpec":
-        for role in self.teams:
-            if role.environment != self.environment or role.team is None:
+        for team in self.teams:
+            if team.environment != self.environment or team.team is None:
                 raise ValueError(
-                    f"{role.name} is not a team of {self.environment}. Its file needs the same environment, and the key team."
+                    f"{team.name} is not a team of {self.environment}. Its file needs the same environment, and the key team."
                 )
-        if len({role.name for role in self.teams}) < len(self.teams):
+        if len({team.name for team in self.teams}) < len(self.teams):
             raise ValueError("two teams have the same name. Give each team's file its own name.")
         return self
 
