@@ -98,9 +98,8 @@ class LiveModel:
                 f"to ask {self.name!r}, put a key into the environment variable {KEY_VARIABLE}, or name a server of "
                 "your own with --base-url (http://localhost:11434/v1 for Ollama)"
             )
-        self.base_url = (
-            self.base_url or _OPENAI_URL
-        )  # without an address, the client would take even an empty OPENAI_BASE_URL
+        # Without an address, the client would take even an empty OPENAI_BASE_URL.
+        self.base_url = self.base_url or _OPENAI_URL
         try:
             self._client = self._connect()
         except ImportError:
