@@ -142,10 +142,9 @@ def compute_proxy_rewards(
 ) -> Float[np.ndarray, "time episodes agents"]:
     """Compute the proxy rewards of whole episodes by the decoders of a single seed, in the unit of the return."""
     n_steps, n_episodes = np.shape(steps.next_timestep.terminated)
-    # Rewards are computed from stored steps, so a new replay stores these episodes alone.
-    buffer = empty_replay(
-        config, n_episodes, 2 * n_steps + 2
-    )  # each repeated last step is stored as an episode of two rows
+    # Rewards are computed from stored steps, so a new replay stores these episodes alone. Each repeated last step is stored as an
+    # episode of two rows.
+    buffer = empty_replay(config, n_episodes, 2 * n_steps + 2)
 
     @jax.jit
     def compute(steps: Trajectory, factors: Array) -> Array:
@@ -184,9 +183,8 @@ def sample_steps(run: Run, actor: Any = None) -> list[TeamSample]:
     played = play_run(run, N_SAMPLE_EPISODES, actor=actor, key=1)
     config, samples = played.config, []
     ended = played.mask & ~np.append(played.mask[1:], np.zeros_like(played.mask[:1]), axis=0)
-    is_last = is_paid(
-        config.payments, np.arange(len(ended))[:, None], played.reward, ended
-    )  # of the steps that a payment is for
+    # Of the steps that a payment is for.
+    is_last = is_paid(config.payments, np.arange(len(ended))[:, None], played.reward, ended)
     is_known = bool(has_step_rewards(played.reward, is_last[..., None], played.mask[..., None]))
     steps = jax.tree.map(lambda leaf: np.asarray(leaf)[played.mask], played.steps)  # [steps ...]
     for team_index, role in enumerate(run.config.task.roles):  # its rows of all episodes, as if they were one

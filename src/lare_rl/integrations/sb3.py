@@ -76,9 +76,8 @@ class CreditReplayBuffer(ReplayBuffer):
             raise LareError(f"{name} cannot store observations of {observation_space}: {hint}")
         super().__init__(buffer_size, observation_space, action_space, *args, **kwargs)
         check_capacity(credit, self.buffer_size * self.n_envs)
-        self.step_ids = np.full(
-            (self.buffer_size, self.n_envs), -1
-        )  # those of the assigner; -1 if there is no step yet
+        # Those of the assigner; -1 if there is no step yet.
+        self.step_ids = np.full((self.buffer_size, self.n_envs), -1)
         self._attach_assigner(credit)
 
     @property

@@ -137,12 +137,9 @@ class MLflow(Listener):
                 run = self.client.create_run(self.experiment, run_name=f"{self.name} seed {seed}")
                 self.runs[seed] = run.info.run_id
                 self.client.log_batch(self.runs[seed], params=self.parameters)
-            numbers = [
-                self.metric(
-                    re.sub(r"[^\w.: /-]", "_", key), value, now_ms, line["step"]
-                )  # MLflow refuses other characters
-                for key, value in known_numbers(line).items()
-            ]
+            # MLflow refuses other characters in names.
+            named_values = {re.sub(r"[^\w.: /-]", "_", key): value for key, value in known_numbers(line).items()}
+            numbers = [self.metric(name, value, now_ms, line["step"]) for name, value in named_values.items()]
             self.client.log_batch(self.runs[seed], metrics=numbers)
 
     def on_stop(self) -> None:
