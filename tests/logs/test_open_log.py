@@ -37,3 +37,16 @@ def test_failed_output_is_undone(tmp_path):
     with pytest.raises(LareError, match="log cannot be written"), atomic_output(tmp_path / "log", True):
         pass  # nothing is written
     assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
+
+
+def test_output_after_a_killed_process(tmp_path):
+    for name in (".log.1.new", ".log.2.old", ".other.1.new"):
+        (tmp_path / name).mkdir()
+    (tmp_path / ".log.2.old" / "0.npz").write_text("the old data")
+    with pytest.raises(LareError, match="log exists"), atomic_output(tmp_path / "log", False):
+        pass
+    assert (tmp_path / "log" / "0.npz").read_text() == "the old data"
+    with atomic_output(tmp_path / "log", True) as new:
+        new.write_text("new")
+    assert (tmp_path / "log").read_text() == "new"
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".other.1.new", "log"]

@@ -1,6 +1,7 @@
 """A log in any format, and output that is written completely or not at all."""
 
 import contextlib
+import glob
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
@@ -106,20 +107,35 @@ def atomic_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> I
 
     Raises `LareError` if `out` exists, or cannot be written: see `check_output`.
     """
+    _clean_up(out)
     check_output(out, overwrite, folders)
     new, old = (out.with_name(f".{out.name}.{uuid4().hex}.{kind}") for kind in ("new", "old"))
     try:
         yield new
         check_output(out, overwrite, folders)
-        if out.exists():
+        if out.is_dir() or (out.exists() and new.is_dir()):  # which nothing replaces at once
             out.rename(old)
-        new.rename(out)
+        new.replace(out)
     except OSError as error:
         raise LareError(f"{out} cannot be written ({error.strerror or error}); existing data are unchanged") from error
     finally:
         if old.exists() and not out.exists():
             old.rename(out)
         for path in (new, old):
-            shutil.rmtree(path, ignore_errors=True)  # does nothing for a file or a link
-            with contextlib.suppress(OSError):
-                path.unlink()
+            _remove(path)
+
+
+def _clean_up(out: Path) -> None:
+    """Put back the data that a killed process had moved away, and remove what it had written so far."""
+    with contextlib.suppress(OSError):
+        for path in out.parent.glob(f".{glob.escape(out.name)}.*"):
+            if path.suffix == ".old" and not out.exists():
+                path.rename(out)
+            elif path.suffix in (".old", ".new"):
+                _remove(path)
+
+
+def _remove(path: Path) -> None:
+    shutil.rmtree(path, ignore_errors=True)  # does nothing for a file or a link
+    with contextlib.suppress(OSError):
+        path.unlink()
