@@ -337,12 +337,16 @@ class Store:
         length[is_running] = self.payments.window or mean_length
         if self.payments.window is not None or not is_running.any():
             return length
-        for episode in self.running.values():
-            n_steps = len(episode.step_ids) - episode.n_paid
-            if n_steps > mean_length:
-                unpaid = np.array(episode.step_ids[episode.n_paid :])
-                length[np.isin(rows, unpaid[unpaid >= self.oldest_step] % self.capacity)] = n_steps
-        return length
+        unpaid = [np.array(episode.step_ids[episode.n_paid :], np.int64) for episode in self.running.values()]
+        unpaid = [step_ids for step_ids in unpaid if len(step_ids) > mean_length]
+        if not unpaid:
+            return length
+        counts = [len(step_ids) for step_ids in unpaid]
+        step_ids, n_steps = np.concatenate(unpaid), np.repeat(counts, counts)
+        is_stored = step_ids >= self.oldest_step
+        running_length = np.zeros(self.capacity, length.dtype)
+        running_length[step_ids[is_stored] % self.capacity] = n_steps[is_stored]
+        return np.where(running_length[rows] > 0, running_length[rows], length)
 
     @property
     def mean_length(self) -> int:
