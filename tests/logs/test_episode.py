@@ -76,6 +76,13 @@ def test_infer_layout_of_choices(task):
         infer_layout("a", values, None)
     with pytest.raises(LareError, match=r"actions.*\[0, 3, 1\]"):
         parse({"actions": np.array([0, 3, 1])}, layout)
+    columns = values | {"actions": np.array(values["actions"])[:, None]}
+    layout = infer_layout("a", columns, task.model_copy(update={"action_size": 3}))
+    np.testing.assert_array_equal(
+        layout.action.rows(columns["actions"], "actions"), np.eye(3)[np.array(values["actions"])]
+    )
+    with pytest.raises(LareError, match="choices is unknown"):
+        infer_layout("a", columns, None)
 
 
 def any_array():

@@ -76,20 +76,22 @@ def infer_layout(name: str, values: Mapping[str, Any], role: TaskSpec | None) ->
     layouts = {}
     for kind in ("observation", "action"):
         array = to_array(values.get(f"{kind}s", np.zeros((0, 0))), f"{name}: {kind}s")
-        is_discrete = array.dtype.kind in "iu" and array.ndim == 1
+        is_column = kind == "action" and array.ndim == 2 and array.shape[1] == 1  # as replay buffers store choices
+        is_discrete = array.dtype.kind in "iu" and (array.ndim == 1 or is_column)
         if is_discrete and kind not in sizes:
             raise LareError(
                 f"{name}: {kind}s are whole numbers, and the number of choices is unknown: write it into a task file ({kind}_size; "
-                "docs/reference/logs.md), and give it with --task FILE"
+                "docs/reference/logs.md), and give it with --task FILE. If they are no choices, write them as floating-point numbers"
             )
         if is_discrete and sizes[kind] != 1:
-            layouts[kind] = SpaceLayout(kind="choices", choices=(sizes[kind],), first=(0,))
+            shape = (1,) if is_column else ()
+            layouts[kind] = SpaceLayout(kind="choices", shape=shape, choices=(sizes[kind],), first=(0,))
         else:
             layouts[kind] = SpaceLayout(kind="numbers", shape=array.shape[1:])
             if array.size and kind in sizes and layouts[kind].size != sizes[kind]:
                 raise LareError(
                     f"{name}: {kind}s have rows of {layouts[kind].size} numbers, and the task has {kind}_size = {sizes[kind]}; choices "
-                    "must be whole numbers from 0, of the shape (T,)"
+                    "must be whole numbers from 0, of the shape (T,) or (T, 1)"
                 )
     max_episode_steps = None if role is None else role.max_episode_steps
     return LogLayout(**layouts, max_episode_steps=max_episode_steps, has_groups="group" in values)
