@@ -109,6 +109,16 @@ def test_data_set_arrays_of_fixed_shape(tmp_path):
     check_log(open_log(tmp_path / "log"), logged_episodes(1))
 
 
+def test_whole_episodes_with_a_score_and_a_number(tmp_path):
+    episodes = list(logged_episodes(3))
+    rows = episode_rows(episodes).drop_columns("rewards")
+    rows = rows.append_column("score", pa.array([1.0, 2.0, 3.0])).append_column("episode", pa.array([0, 1, 2]))
+    write_parquet(rows, tmp_path / "log.parquet")
+    parsed = list(open_log(tmp_path / "log.parquet").episodes())
+    assert [len(episode) for episode in parsed] == [len(episode["actions"]) for episode in episodes]
+    assert [episode.reward.sum() for episode in parsed] == [1, 2, 3]
+
+
 def test_data_set_with_splits(tmp_path):
     rows = step_rows(logged_episodes(1))
     rows = rows.drop_columns("rewards").append_column("score", pa.array([2.5] * len(rows)))

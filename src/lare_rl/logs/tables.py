@@ -155,12 +155,12 @@ def _first_difference(expected: pa.Schema, actual: pa.Schema) -> str:
 def _rows_are_episodes(schema: pa.Schema) -> bool:
     """Return whether each row is a whole episode: `rewards` (or `actions`, if there are no rewards) is a list column.
 
-    Without rewards, a column `episode` says that rows are steps: the action of a step may be a list, too.
+    Without rewards, the columns `episode` and `next_observations` say that rows are steps: the action of a step may be a list, too.
     """
     types = dict(zip(schema.names, schema.types, strict=True))
     if "rewards" in types:
         return _is_list(types["rewards"])
-    return "episode" not in types and _is_list(types.get("actions", pa.null()))
+    return not {"episode", "next_observations"} <= types.keys() and _is_list(types.get("actions", pa.null()))
 
 
 def _is_text(data_type: pa.DataType) -> bool:
