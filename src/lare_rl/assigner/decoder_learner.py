@@ -141,10 +141,10 @@ class DecoderLearner:
 
     def _forget_since(self, step_id: int) -> None:
         """Abandon the episodes with this step or later ones, which are all pending."""
-        forgotten = set(map(id, self.store.forget_since(step_id)))
-        waiting = [[episode for episode in batch if id(episode) not in forgotten] for batch in self._pending_episodes]
+        self.store.forget_since(step_id)
+        waiting = [[episode for episode in batch if episode.step_ids[-1] < step_id] for batch in self._pending_episodes]
         self._pending_episodes = deque(filter(None, waiting))
-        self._pending_returns = [episode for episode in self._pending_returns if id(episode) not in forgotten]
+        self._pending_returns = [episode for episode in self._pending_returns if episode.step_ids[-1] < step_id]
 
     def _fill_history(self, rows: Int[np.ndarray, " n"]) -> None:
         """Compute the history of steps in their order. Their other inputs are stored, and all inputs of earlier steps."""

@@ -306,21 +306,20 @@ class Store:
         episode = self.running.pop(env_id, None)
         self.dropped += episode is not None and not episode.is_abandoned
 
-    def forget_since(self, step_id: int) -> list[StoredEpisode]:
-        """Abandon the episodes that have this step or later ones, with what follows. Return those of them that had ended."""
+    def forget_since(self, step_id: int) -> None:
+        """Abandon the episodes that have this step or later ones, with what follows."""
         for episode in self.running.values():
             if episode.step_ids[-1] >= step_id and not episode.is_abandoned:
                 episode.is_abandoned = True
                 self.dropped += 1
-        numbers = [number for number, episode in self.episodes.items() if episode.step_ids[-1] >= step_id]
-        self.dropped += len(numbers)
-        forgotten = [self.episodes.pop(number) for number in numbers]
+        n_before = len(self.episodes)
+        self.episodes = {n: episode for n, episode in self.episodes.items() if episode.step_ids[-1] < step_id}
+        self.dropped += n_before - len(self.episodes)
         self.oldest = [entry for entry in self.oldest if entry[1] in self.episodes]
         heapq.heapify(self.oldest)
         rows = np.arange(step_id, self.n_added) % self.capacity
         self.inputs[rows] = self.length[rows] = 0
         self.episode[rows] = -1
-        return forgotten
 
     def rows(self, step_ids: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
         """Return the rows of stored steps. Raises `LareError` if a step was never stored, or is not stored any more."""

@@ -49,12 +49,12 @@ from lare_rl.credit.score_type import ScoreType
 from lare_rl.envs.interface import AnyArray
 from lare_rl.nn.normalise import RunningMeanStd
 
-__all__ = ["Explanation", "ExplanationState", "add_to_explanation", "explain", "init_explanation"]
+__all__ = ["NOTICEABLE_SHARE", "Explanation", "ExplanationState", "add_to_explanation", "explain", "init_explanation"]
 
 MAX_EXPLANATION_ROUNDS = 100
 """The maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
-USED_SHARE = 0.05
-"""A raw feature that explains more than this share of the variation is used, be it by its pairs alone."""
+NOTICEABLE_SHARE = 0.05
+"""Nothing is said about the effect of a factor, or about a raw feature, with a smaller share. A raw feature with a larger one is used."""
 MIN_MEAN_STD = 1e-5
 """The means of a standardised factor over episodes vary by more than rounding if their standard deviation exceeds this."""
 MIN_SAME = 1 - 2e-6
@@ -157,7 +157,7 @@ def explain(
         mean_length=mean_length,
         explains_mean_reward=explains_mean_reward,
         total_r2=full.r2,
-        raw_feature_used=_is_used(full, basis) | (raw_shares > USED_SHARE),  # the latter also by its pairs
+        raw_feature_used=_is_used(full, basis) | (raw_shares > NOTICEABLE_SHARE),  # the latter also by its pairs
         raw_feature_shares=raw_shares,
         residual_correlation=jnp.zeros(basis.n_raw_used),
     )

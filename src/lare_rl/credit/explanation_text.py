@@ -9,7 +9,7 @@ import numpy as np
 from lare_rl.credit import decoder_state, learning
 from lare_rl.credit.basis import MAX_PAIRED_RAW_FEATURES
 from lare_rl.credit.decoder_state import DecoderState
-from lare_rl.credit.explanation import Explanation
+from lare_rl.credit.explanation import NOTICEABLE_SHARE, Explanation
 from lare_rl.credit.prequential import LITTLE_R2
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.credit.spec import CreditSpec
@@ -25,8 +25,6 @@ MIN_EXPLAINED_EPISODES = 20
 """With fewer episodes, nothing is said."""
 COMPLETE_SHARE = 0.95
 """No factor is missing if the factors explain a larger share."""
-NOTICEABLE_SHARE = 0.05
-"""Nothing is said about the effect of a factor, or about a raw feature, with a smaller share."""
 LARGE_SHARE = 0.1
 """Raw features are named if they add a larger share to the share of the factors."""
 STRAIGHT_SHARE = 0.8

@@ -71,7 +71,8 @@ def record_frames(
     """Return the frames that `record_video` shows, and the seconds for which it shows each.
 
     Args:
-        max_fps: the largest number of frames per second of a simulation on the host. Other films have 25, or 8 of many agents.
+        max_fps: the largest number of frames per second, for a simulation on the host. A film of an environment in JAX has 25 frames
+            per second, and a film of many agents has 8.
         max_frames: the largest number of frames. A longer film ends early; that of a single agent in JAX leaves steps out, and so
             shows the episode faster.
         played: episodes of a run with many agents; the film shows the first. By default, the policy plays new episodes. A run
@@ -145,10 +146,8 @@ def _to_images(frames: Iterable[Frame]) -> list[Any]:
 
 def _encode(images: Sequence[Any], file_format: str, frame_seconds: float, **options: Any) -> bytes:
     """Return an animation that repeats. A frame of a GIF lasts whole hundredths of a second."""
-    buffer, duration_ms = (
-        BytesIO(),
-        round(100 * frame_seconds) * 10 if file_format == "GIF" else round(1000 * frame_seconds),
-    )
+    buffer, unit_ms = BytesIO(), 10 if file_format == "GIF" else 1
+    duration_ms = unit_ms * round(1000 * frame_seconds / unit_ms)
     first, *rest = images
     first.save(buffer, file_format, save_all=True, append_images=rest, duration=duration_ms, loop=0, **options)
     return buffer.getvalue()

@@ -3,9 +3,9 @@
     observation [batch *agents observation]  ->  action [batch *agents action], or the number of a choice [batch *agents]
 
 PPO and IPPO also return the `logits` of choices, (batch, *agents, choices). A choice that is sampled from them can earn far more than
-the most likely one. Only tasks of many agents have the axis `*agents`. The networks of QMIX and VDN have a memory. Their policies also
-take `hidden` (zeros at the first step, then the last `next_hidden`) and `last_action` (one more than the largest action at the first
-step, then the last `action`).
+the most likely one. The axis `*agents` exists only in tasks with many agents. The networks of QMIX and VDN have a memory. So their
+policies also take `hidden` (zeros at the first step, then the last `next_hidden`) and `last_action` (one more than the largest action
+at the first step, then the last `action`).
 """
 
 from functools import partial

@@ -10,7 +10,7 @@ import numpy as np
 from lare_rl.assigner.space_layout import to_array
 from lare_rl.errors import LareError, short_repr
 from lare_rl.logs.episode import KEYS, RelabelledEpisode
-from lare_rl.logs.log import Log, atomic_output
+from lare_rl.logs.log import Log, atomic_output, list_files
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.files import write_npz
 from lare_rl.util.npz import open_npz
@@ -47,10 +47,7 @@ class NpzLog(ArrayLog):
     """Files in the order of their names. Arrays with other names than those of `parse_episode` are copied unchanged."""
 
     def __init__(self, directory: Path, role: TaskSpec | None):
-        self.name, self.files = (
-            str(directory),
-            sorted(path for path in directory.glob("*.npz") if not path.name.startswith(".")),
-        )
+        self.name, self.files = str(directory), list_files(directory, ".npz")
         if not self.files:
             raise LareError(f"{directory} holds no .npz and no .parquet files")
         self.n_episodes = len(self.files)

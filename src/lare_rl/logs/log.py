@@ -14,7 +14,7 @@ from lare_rl.logs.episode import LoggedEpisode, LogLayout, RelabelledEpisode, in
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.files import check_writable
 
-__all__ = ["Log", "atomic_output", "batch_by_steps", "check_output"]
+__all__ = ["Log", "atomic_output", "batch_by_steps", "check_output", "list_files"]
 
 _Item = TypeVar("_Item")
 
@@ -99,6 +99,11 @@ def check_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> No
     if not out.name or not out.parent.is_dir():
         raise LareError(f"{out} cannot be written: there is no directory {out.parent}")
     check_writable(out)
+
+
+def list_files(directory: Path, suffix: str) -> list[Path]:
+    """Return the files of a log by their names. Hidden ones, such as those that archives of macOS have, are no part of it."""
+    return sorted(path for path in directory.glob(f"*{suffix}") if not path.name.startswith("."))
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ import numpy as np
 
 from lare_rl.errors import LareError, missing_extra_error, short_repr
 from lare_rl.logs.episode import KEYS, LoggedEpisode, RelabelledEpisode
-from lare_rl.logs.log import BATCH_STEPS, Log, atomic_output, batch_by_steps
+from lare_rl.logs.log import BATCH_STEPS, Log, atomic_output, batch_by_steps, list_files
 from lare_rl.tasks.spec import TaskSpec
 
 try:
@@ -85,8 +85,7 @@ class ParquetLog(TableLog):
     """A Parquet file, or a directory of files with the same columns, in the order of their names. The output is one file."""
 
     def read_batches(self) -> Iterator[pa.RecordBatch]:
-        files = [path for path in sorted(self.path.glob("*.parquet")) if not path.name.startswith(".")]
-        files = files if self.path.is_dir() else [self.path]
+        files = list_files(self.path, ".parquet") if self.path.is_dir() else [self.path]
         schema = None
         for file in files:
             try:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field, field_validator
+from pydantic import BeforeValidator, Field
 
 from lare_rl.config.migrate import CONFIG
 from lare_rl.config.settings import ResolvedSettings, Settings
@@ -22,7 +22,13 @@ from lare_rl.util.safe_io import read_table
 if TYPE_CHECKING:
     from lare_rl.latent.function import LatentFunction
 
-__all__ = ["RunPlan", "load_config"]
+__all__ = ["FunctionPaths", "RunPlan", "load_config"]
+
+
+FunctionPaths = Annotated[
+    tuple[Path, ...], BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)
+]
+"""The files of latent functions in a file: one path, or a list with one for each team."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +38,7 @@ class RunPlan:
     task: str | TaskSpec | None = None
     settings: Settings = field(default_factory=Settings)
     function: "tuple[Path | LatentFunction, ...] | None" = None
-    """The latent functions: one or, of several teams, one for each. None: those that the settings name."""
+    """The latent functions: one, or one for each team. None: the functions that the settings choose."""
     out: Path | None = None
     """The directory of the run."""
     source: Path | None = None
@@ -65,13 +71,8 @@ class _PlanFile(Settings):
     """The keys of a file."""
 
     task: Annotated[str, Field(min_length=1)] | None = None
-    function: tuple[Path, ...] | None = None
+    function: FunctionPaths | None = None
     out: Path | None = None
-
-    @field_validator("function", mode="before")
-    @classmethod
-    def _read_one_path(cls, value: Any) -> Any:
-        return (value,) if isinstance(value, str) else value
 
 
 def load_config(path: str | Path) -> RunPlan:

@@ -10,13 +10,14 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from lare_rl.config.effective import describe_unused_settings
 from lare_rl.config.settings import Settings
 from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import load_task, resolve_path
 from lare_rl.errors import LareError
+from lare_rl.runs.plan import FunctionPaths
 from lare_rl.sweep.jobs import Job, check_job, make_job
 from lare_rl.sweep.processes import train_in_processes, train_on_ray
 from lare_rl.sweep.resources import Resources
@@ -30,10 +31,6 @@ Names = Annotated[tuple[str, ...], Field(min_length=1)]
 Draws = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
 
-def _path_to_tuple(value: Any) -> Any:
-    return (value,) if isinstance(value, str) else value
-
-
 class Sweep(Resources):
     """The contents of a sweep's file. Paths are relative to the file."""
 
@@ -44,7 +41,7 @@ class Sweep(Resources):
     """By default, the algorithm of each task."""
     draws: Draws = (0,)
     """Draws of the latent functions from the recorded replies. Methods without a latent function are trained once."""
-    functions: dict[str, Annotated[tuple[Path, ...], BeforeValidator(_path_to_tuple)]] = Field(default_factory=dict)
+    functions: dict[str, FunctionPaths] = Field(default_factory=dict)
     """Files of latent functions by the name of their task: one, or one for each team. By default, recorded replies are used."""
     settings: dict[str, Any] = Field(default_factory=dict)
     """Other settings of `lare-rl train`, such as steps and seeds."""
