@@ -52,8 +52,8 @@ _log = logging.getLogger(__name__)
 _FAMILIAR_PACKAGES = {"gymnasium", "gymnasium_robotics", "lare_rl", "mpe2", "pettingzoo", "minigrid", "ale_py"}
 """Packages whose environments can share a process. Environments of others are tried."""
 
-_separate_tasks: dict[str, bool] = {}
-"""Whether each environment of a task needs its own process, by the JSON of the tasks that have been tried."""
+_separate_tasks: dict[TaskSpec, bool] = {}
+"""Whether each environment of a task needs its own process, for the tasks that have been tried."""
 
 
 class SeparateEnv:
@@ -87,14 +87,9 @@ def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
     return SeparateEnv(task) if runs_separately(task) and not kwargs else make_local_env(task, **kwargs)
 
 
+@lru_cache(maxsize=64)
 def load_env_spec(task: TaskSpec) -> EnvSpec:
     """Return the specification of a task's environment, which is made once for this. Raises `LareError` like `make_env`."""
-    return _load_env_spec(task.model_dump_json())
-
-
-@lru_cache(maxsize=64)
-def _load_env_spec(task_json: str) -> EnvSpec:
-    task = TaskSpec.model_validate_json(task_json)
     env = make_host_env(task) if task.processes == "separate" else make_env(task)
     if not env.spec.is_jax:
         close_env(env, f"environment {task.environment!r}")
@@ -126,18 +121,17 @@ def n_open_envs(task: TaskSpec, n_seeds: int, n_episodes: int) -> int:
 
 def runs_separately(task: TaskSpec) -> bool:
     """Return whether each environment of a task needs its own process, by its file or an earlier trial."""
-    return task.processes == "separate" or _separate_tasks.get(task.model_dump_json(), False)
+    return task.processes == "separate" or _separate_tasks.get(task, False)
 
 
 def needs_process(task: TaskSpec) -> bool:
     """Return whether each environment of a task needs its own process. Environments are tried at most once."""
     if task.processes == "separate":
         return True
-    key = task.model_dump_json()
-    if key not in _separate_tasks:
+    if task not in _separate_tasks:
         package = None if load_env_spec(task).is_jax else _find_package(task)
-        _separate_tasks[key] = package not in (None, *_FAMILIAR_PACKAGES) and _try_second(task)
-    return _separate_tasks[key]
+        _separate_tasks[task] = package not in (None, *_FAMILIAR_PACKAGES) and _try_second(task)
+    return _separate_tasks[task]
 
 
 def _try_second(task: TaskSpec) -> bool:
@@ -159,15 +153,11 @@ def _try_second(task: TaskSpec) -> bool:
     return problem is not None
 
 
+@lru_cache(maxsize=64)
 def measure_step_s(task: TaskSpec) -> float:
     """Return the time (s) of a step of a task's environment. It is measured once."""
     needs_process(task)  # decides where `make_host_env` makes it
-    return _measure_task(task.model_dump_json())
-
-
-@lru_cache(maxsize=64)
-def _measure_task(task_json: str) -> float:
-    with contextlib.closing(make_host_env(TaskSpec.model_validate_json(task_json))) as env:
+    with contextlib.closing(make_host_env(task)) as env:
         return env.envs.measure_step_s() if isinstance(env, SeparateEnv) else time_steps(env)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BeforeValidator, ConfigDict, Field, StrictInt, field_validator, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, JsonValue, StrictInt, field_validator, model_validator
 
 from lare_rl.errors import CheckedModel, Count, LareError
 from lare_rl.tasks.payments import PaymentRule
@@ -85,6 +85,13 @@ def _number_to_paid_steps(value: Any) -> Any:
     return {"steps": value} if type(value) is int else value
 
 
+def _tuples_to_lists(value: Any) -> Any:
+    """Return arguments as the file of a run stores them, which has no tuples."""
+    if isinstance(value, dict):
+        return {key: _tuples_to_lists(item) for key, item in value.items()}
+    return [_tuples_to_lists(item) for item in value] if isinstance(value, list | tuple) else value
+
+
 class TaskSpec(CheckedModel):
     """A task: an environment and the texts that describe it."""
 
@@ -132,7 +139,7 @@ class TaskSpec(CheckedModel):
     hangs or changes the first."""
     timeout: Annotated[float, Field(gt=0)] = 120.0
     """Time (s) within which an environment in another process must reply; else the run stops with a message."""
-    arguments: dict[str, Any] = Field(default_factory=dict)
+    arguments: Annotated[dict[str, JsonValue], BeforeValidator(_tuples_to_lists)] = Field(default_factory=dict)
     """Keyword arguments of the environment, for families that take them, such as `pettingzoo/...` and `gymnax/...`."""
     agents: tuple[str, ...] = ()
     """Names of the agents that this file describes, or patterns such as `prey_*`. By default all. For environments whose agents
@@ -143,20 +150,6 @@ class TaskSpec(CheckedModel):
     """One task for each team that learns separately, with its own texts. In TOML, the names of their files."""
     team: str | None = None
     """The team that this file describes, if its environment has several."""
-
-    @field_validator("arguments")
-    @classmethod
-    def _check_arguments(cls, arguments: dict[str, Any]) -> dict[str, Any]:
-        problem = (
-            "a run cannot store dates, inf, nan, or keys that are no strings. Use numbers, strings, lists and tables."
-        )
-        try:
-            stored = json.loads(json.dumps(arguments, allow_nan=False))  # as in the file of a run
-        except (TypeError, ValueError):
-            raise ValueError(problem) from None
-        if stored != _tuples_to_lists(arguments):
-            raise ValueError(problem)
-        return stored
 
     @field_validator("measures")
     @classmethod
@@ -225,6 +218,10 @@ class TaskSpec(CheckedModel):
         """The tasks that latent functions are designed for: those of the teams, or this one."""
         return self.teams or (self,)
 
+    def __hash__(self) -> int:
+        """Hash all values. The order of the arguments makes no difference, as in a comparison."""
+        return hash(json.dumps(self.model_dump(mode="json"), sort_keys=True))
+
     @property
     def digest(self) -> str:
         """SHA-256 of all values."""
@@ -268,12 +265,6 @@ def split_environment(name: str) -> tuple[str, str]:
 def _import_origin(environment: str) -> tuple[bool, str]:
     """Return whether an environment is PettingZoo's, and the module that its name imports, or ""."""
     return environment.startswith(PETTINGZOO_PREFIX), split_environment(environment)[0]
-
-
-def _tuples_to_lists(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _tuples_to_lists(item) for key, item in value.items()}
-    return [_tuples_to_lists(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def unwritten_texts(task: TaskSpec) -> list[str]:
