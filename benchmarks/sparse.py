@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 import tyro
 
-from lare_rl.envs.mujoco_rewards import SparseDistanceReward
+from lare_rl.envs.mujoco_rewards import OtherReward
 from measure import write
 from noisy_policy import METHODS, Episode, assess, play
 
@@ -20,7 +20,7 @@ COUNTS = 20, 60
 
 
 def play_with_metres(n_episodes: int, seed: int) -> list[Episode]:
-    env = SparseDistanceReward(gymnasium.make("HalfCheetah-v4"), DISTANCE)
+    env = OtherReward(gymnasium.make("HalfCheetah-v4"), "Sparse", DISTANCE)
     episodes = play(env, n_episodes, seed, ("x_position",))
     return [{**e, "metres": np.diff(e["x_position"], prepend=np.float32(0))} for e in episodes]
 

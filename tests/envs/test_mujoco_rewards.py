@@ -7,7 +7,7 @@ from gymnasium.spaces import Box
 
 from lare_rl.envs.gymnasium_env import make_gymnasium
 from lare_rl.envs.load import read_task
-from lare_rl.envs.mujoco_rewards import HIDDEN_REWARDS, TARGET_SPEEDS, SparseDistanceReward, register
+from lare_rl.envs.mujoco_rewards import HIDDEN_REWARDS, TARGET_SPEEDS, OtherReward, register
 
 SPARSE = "lare/HalfCheetahSparse-v4"
 
@@ -26,7 +26,7 @@ SPARSE = "lare/HalfCheetahSparse-v4"
 def test_hidden_rewards_by_hand(name, velocity, foot_angle, effort, reward):
     next_obs = np.zeros(17)
     next_obs[[8, 7]] = velocity, foot_angle
-    assert HIDDEN_REWARDS[name](next_obs, effort, 2.0) == pytest.approx(reward)
+    assert HIDDEN_REWARDS[name](next_obs, effort, 2.0, {}, False) == pytest.approx(reward)
 
 
 @pytest.mark.parametrize("name", [f"{body}{reward}-v4" for body in TARGET_SPEEDS for reward in HIDDEN_REWARDS])
@@ -45,7 +45,8 @@ def test_only_the_reward_differs(name):
         np.testing.assert_array_equal(next_obs, expected)
         assert ends == expected_ends
         compute_reward = HIDDEN_REWARDS[name.removeprefix(body).removesuffix("-v4")]
-        assert reward == pytest.approx(compute_reward(next_obs, float(np.sum(action**2)), TARGET_SPEEDS[body]))
+        effort = float(np.sum(action**2))
+        assert reward == pytest.approx(compute_reward(next_obs, effort, TARGET_SPEEDS[body], {}, False))
         assert reward != pytest.approx(original_reward)
 
 
@@ -74,15 +75,15 @@ class OneStep(gymnasium.Env):
 def test_sparse_reward_by_hand(x_position, terminated, truncated, reward):
     env = OneStep(x_position, terminated, truncated)
     observation, _, *rest = env.result
-    assert SparseDistanceReward(env).step(np.zeros(1)) == (observation, reward, *rest)
+    assert OtherReward(env, "Sparse", 500.0).step(np.zeros(1)) == (observation, reward, *rest)
 
 
 def test_sparse_half_cheetah():
     """The wrapper must be outside the time limit, to see the end of an episode."""
-    assert make_gymnasium(SPARSE).get_wrapper_attr("distance") == 500.0
+    assert make_gymnasium(SPARSE).get_wrapper_attr("target") == 500.0
     env = make_gymnasium(SPARSE, max_episode_steps=20)
     env.reset(seed=0)
-    env.set_wrapper_attr("distance", -100.0)
+    env.set_wrapper_attr("target", -100.0)
     results = [env.step(np.zeros(6, np.float32)) for _ in range(20)]
     env.close()
     spec = gymnasium.registry[SPARSE]

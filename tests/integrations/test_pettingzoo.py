@@ -189,7 +189,6 @@ def test_checker_of_pettingzoo(recwarn):
 @pytest.mark.parametrize(
     ("team", "changes", "message"),
     [
-        (Toy(NAMES), {"agents": 2}, "agents=2.* has 3"),
         (
             Toy(NAMES, actions={"a_0": spaces.Discrete(3), "a_1": spaces.Discrete(2), "a_2": spaces.Discrete(3)}),
             {},

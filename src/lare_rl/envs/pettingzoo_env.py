@@ -133,15 +133,9 @@ class ParallelHost:
             observations, infos, reward, observes, alive, ended and not was_truncated, was_truncated or reached_limit
         )
 
-    def render(self) -> np.ndarray:
+    def render(self) -> Any:
         with one_line_errors(f"{self._label} failed in render"):
-            pixels = self.environment.render()
-        if not isinstance(pixels, np.ndarray) or pixels.ndim != 3 or pixels.shape[2] != 3:
-            raise LareError(
-                f"{self._label} renders {short_repr(pixels)}, not pixels (height, width, 3). "
-                "It must support the render mode 'rgb_array'."
-            )
-        return pixels
+            return self.environment.render()
 
     def close(self) -> None:
         close_env(self.environment, self._label)

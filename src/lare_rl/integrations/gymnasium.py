@@ -25,7 +25,7 @@ from lare_rl.envs.episodic import TRUE_REWARD, read_score
 from lare_rl.errors import LareError, short_repr
 from lare_rl.integrations.recorder import CREDIT_STEP, Pay, StepRecorder, check_pay
 
-__all__ = ["CREDIT_STEP", "Credit", "VectorCredit", "batch_of_one"]
+__all__ = ["CREDIT_STEP", "Credit", "VectorCredit"]
 
 
 class Credit(gymnasium.Wrapper, RecordConstructorArgs):
@@ -70,9 +70,9 @@ class Credit(gymnasium.Wrapper, RecordConstructorArgs):
         if self.score is not None:
             credit_reward = read_score(info, self.score) if terminated or truncated else 0.0
         steps = self._recorder.add(
-            batch_of_one(self.env.observation_space, self._observation, "the observation"),
-            batch_of_one(self.env.action_space, action, "the action"),
-            batch_of_one(self.env.observation_space, observation, "the observation"),
+            _batch_of_one(self.env.observation_space, self._observation, "the observation"),
+            _batch_of_one(self.env.action_space, action, "the action"),
+            _batch_of_one(self.env.observation_space, observation, "the observation"),
             [credit_reward],
             [terminated],
             [truncated],
@@ -206,7 +206,7 @@ def _check_score(credit: CreditAssigner, score: str | None) -> None:
         )
 
 
-def batch_of_one(space: gymnasium.Space, element: Any, name: str) -> Any:
+def _batch_of_one(space: gymnasium.Space, element: Any, name: str) -> Any:
     """Return a batch with one element of a space, as in a vector environment. Raises `LareError`, with the name, for another value."""
     try:
         return concatenate(space, [element], create_empty_array(space, 1))

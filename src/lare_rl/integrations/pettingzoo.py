@@ -2,6 +2,7 @@
 
 from collections import ChainMap
 from copy import deepcopy
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -9,9 +10,10 @@ from jaxtyping import Float
 
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.assigner.space_layout import make_layout
+from lare_rl.envs.env_errors import convert_output
 from lare_rl.envs.episodic import TRUE_REWARD
+from lare_rl.envs.spaces import flatten_value
 from lare_rl.errors import LareError, missing_extra_error
-from lare_rl.integrations.gymnasium import batch_of_one
 from lare_rl.integrations.recorder import CREDIT_STEP, Pay, StepRecorder, check_pay
 
 try:
@@ -115,11 +117,11 @@ class CreditParallel(BaseParallelWrapper):
         self, rows: Float[np.ndarray, "agents size"], kind: Literal["observation", "action"], values: dict
     ) -> Float[np.ndarray, "agents size"]:
         """Return a copy of the rows with the new observations or actions of some agents."""
-        rows, layout = rows.copy(), self._recorder.layouts[kind]
+        rows = rows.copy()
         for index, agent in enumerate(self.team):
             if agent in values:
-                space = getattr(self.env, f"{kind}_space")(agent)
-                rows[index] = layout.rows(batch_of_one(space, values[agent], f"the {kind} of {agent}"), kind)[0]
+                flatten = partial(flatten_value, getattr(self.env, f"{kind}_space")(agent))
+                rows[index] = convert_output(flatten, values[agent], f"the {kind} of {agent}")
         return rows
 
     def _to_batch(

@@ -8,7 +8,6 @@
 The environment's rewards are unchanged, so that the returns that are logged and evaluated are the true ones.
 """
 
-import re
 import warnings
 from copy import deepcopy
 from typing import Any
@@ -18,22 +17,15 @@ from gymnasium import spaces
 from jaxtyping import Float, Int
 
 from lare_rl.assigner.assigner import CreditAssigner
-from lare_rl.errors import LareError, install_command, missing_extra_error
+from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.integrations.recorder import StepRecorder, check_assigner, check_capacity
 
 try:
-    import stable_baselines3
+    from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 except ImportError as missing:
     raise missing_extra_error("lare_rl.integrations.sb3", "sb3") from missing
-if [int(number) for number in re.findall(r"\d+", stable_baselines3.__version__)[:2]] < [2, 9]:
-    raise LareError(
-        f"lare_rl.integrations.sb3 needs stable-baselines3 2.9 or later, and {stable_baselines3.__version__} is installed: "
-        f"{install_command('sb3')} --upgrade"
-    )
-
-from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 __all__ = ["CreditCallback", "CreditDictReplayBuffer", "CreditNStepReplayBuffer", "CreditReplayBuffer"]
 
