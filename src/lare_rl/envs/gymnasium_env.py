@@ -105,10 +105,8 @@ class GymnasiumEnv:
             entry_meanings=entry_meanings(task.observation),
             **fields,
         )
-        self._decodes = action_space.dtype not in (
-            np.float32,
-            np.float64,
-        )  # actions of these types are within the bounds
+        # Actions of these types are within the bounds.
+        self._decodes = action_space.dtype not in (np.float32, np.float64)
         self._state, self._alive = np.zeros(0, np.float32), np.ones(1, bool)
         self._available = np.ones((1, self.spec.action_size), bool)
 

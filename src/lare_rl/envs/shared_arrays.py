@@ -57,10 +57,9 @@ def _map(name: str, size: int) -> mmap.mmap:
         return mmap.mmap(file.fileno(), size)
 
 
-def map_current(prefix: str, worker_index: int, n_workers: int) -> Int[np.ndarray, "1"]:
+def map_current(prefix: str, worker_index: int) -> Int[np.ndarray, "1"]:
     """Map the index of the environment that a worker calls now."""
-    indices = np.frombuffer(_map(prefix + "current", n_workers * np.dtype(np.int64).itemsize), np.int64)
-    return indices[worker_index : worker_index + 1]
+    return np.frombuffer(_map(f"{prefix}current{worker_index}", np.dtype(np.int64).itemsize), np.int64)
 
 
 def map_arrays(prefix: str, spec: EnvSpec, n: int) -> SharedArrays:

@@ -170,18 +170,16 @@ def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: T
             *values, new_measures = timestep
             for column, value in zip(columns, values, strict=True):
                 column[env_index] = value
-            row = Timestep(
-                *(column[env_index] for column in columns), measures={}
-            )  # numbers beyond float32 are infinite
+            # In the batch, numbers beyond float32 are infinite.
+            row = Timestep(*(column[env_index] for column in columns), measures={})
             check_finite(row, env.spec, owner)
             for name, value in new_measures.items():
                 if name not in measures:
                     raise EnvOutputError(f"{owner}: the measure {name!r} is not in EnvSpec.measures")
                 measures[name][env_index] = value
             missing = sorted(measures.keys() - new_measures.keys())
-            if missing and (
-                timestep.terminated or timestep.truncated
-            ):  # that of an earlier episode is still in the batch
+            # The value of an earlier episode is still in the batch.
+            if missing and (timestep.terminated or timestep.truncated):
                 raise EnvOutputError(
                     f"{owner}: the last step has no measure {missing[0]!r}, which EnvSpec.measures has"
                 )

@@ -66,13 +66,13 @@ class Worker:
             [sys.executable, "-P", "-c", PROGRAM, self._address], stdin=subprocess.PIPE, env=variables, **own_session()
         )
 
-    def start_making(self, makers: Mapping[int, Maker], memory: str, worker_index: int, n_workers: int) -> None:
+    def start_making(self, makers: Mapping[int, Maker], memory: str, worker_index: int) -> None:
         """Make the environments if there are none. Number them by the keys of `makers`, and use this memory from now on."""
-        self.env_indices, self._current = list(makers), map_current(memory, worker_index, n_workers)
+        self.env_indices, self._current = list(makers), map_current(memory, worker_index)
         self._current[0] = self.env_indices[0]
         self._connect()
         pickled = [] if self.specs else [pickle_maker(index, maker) for index, maker in makers.items()]
-        self.send("make", (memory, worker_index, n_workers, self.env_indices, pickled))
+        self.send("make", (memory, worker_index, self.env_indices, pickled))
 
     def _connect(self) -> None:
         """Connect to the process as soon as it listens, unless it is connected. Raises `LareError` if it ends or takes too long."""
@@ -205,11 +205,11 @@ class _EnvServer:
         return None
 
     def _make(
-        self, memory: str, worker_index: int, n_workers: int, env_indices: Sequence[int], makers: Sequence[bytes]
+        self, memory: str, worker_index: int, env_indices: Sequence[int], makers: Sequence[bytes]
     ) -> tuple[tuple[EnvSpec, ...], float]:
         """Make the environments if there are makers, else number those that exist. Return the specifications and the time (s)."""
         start = time.perf_counter()
-        self._current = map_current(memory, worker_index, n_workers)
+        self._current = map_current(memory, worker_index)
         self.envs = dict(zip(env_indices, self.envs.values(), strict=False))
         for index, pickled in zip(env_indices, makers, strict=False):
             self._current[0] = index

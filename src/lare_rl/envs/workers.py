@@ -82,7 +82,7 @@ class SubprocVecEnv(VecEnv):
         n_workers = len(self._workers)
         for worker_index, worker in enumerate(self._workers):
             indices = range(worker_index, len(makers), n_workers)
-            worker.start_making({index: makers[index] for index in indices}, memory, worker_index, n_workers)
+            worker.start_making({index: makers[index] for index in indices}, memory, worker_index)
         for worker, (specs, make_s) in self._receive("make"):
             worker.specs, worker.make_s = specs, max(worker.make_s, make_s)
         specs = [self._workers[index % n_workers].specs[index // n_workers] for index in range(len(makers))]
