@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import signal
 
 import numpy as np
 import pytest
@@ -87,11 +86,6 @@ def test_familiar_packages_and_scripts_share_a_process(monkeypatch):
         assert isinstance(envs, LocalVecEnv)
 
 
-def test_an_environment_that_only_this_process_has(monkeypatch):
-    monkeypatch.setattr(placement, "_find_package", lambda task: "script")
-    assert not needs_process(toy_spec(name="another", max_episode_steps=7))
-
-
 def test_separate_by_the_task_file_starts_once(starts, tmp_path):
     """The first look at the spaces, the steps for verification, a measurement, episodes and a batch share one simulation."""
     task = single_spec("Fails", processes="separate", timeout=7.0)
@@ -109,27 +103,6 @@ def test_separate_by_the_task_file_starts_once(starts, tmp_path):
     assert os.getpid() not in starts()
     close_idle_workers()
     assert len(starts()) == 3
-
-
-def test_hang_ends_soon_after_a_request_to_stop(monkeypatch):
-    monkeypatch.setenv("STALL", __file__)
-    monkeypatch.setattr(workers, "STOP_TIMEOUT_S", 0.5)
-    with make_vec_env(single_spec("Stalls", processes="separate"), 1) as envs:
-        envs.reset(np.ones(1, bool), np.zeros(1, int))
-        envs.stop_requested = lambda: True
-        with pytest.raises(LareError, match=r"did not reply for 0.5 s in step; the run was asked to stop"):
-            envs.step(np.float32([[[0, 0, 1]]]))
-
-
-def test_idle_process_that_died_is_replaced():
-    task = single_spec("Many", processes="separate")
-    with make_vec_env(task, 1) as envs:
-        (pid,) = envs.pids
-    os.kill(pid, signal.SIGKILL)
-    os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
-    with make_vec_env(task, 1) as envs:
-        assert envs.pids != [pid]
-        step_all(envs)
 
 
 def test_few_simulations_are_open_at_a_time(monkeypatch):

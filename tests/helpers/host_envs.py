@@ -51,10 +51,6 @@ class ToyHostEnv:
                 sys.exit("the window is closed")
             case "dies":
                 os.kill(os.getpid(), signal.SIGKILL)
-            case "is signalled":
-                os.kill(os.getpid(), 40)  # a real-time signal without a name
-            case "leaves":
-                os._exit(3)
             case "hangs":
                 time.sleep(600)
 

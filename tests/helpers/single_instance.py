@@ -1,7 +1,4 @@
-"""A simulator that allows one simulation in a process, as libsumo does. `fault` says what a second one does.
-
-One that stalls does so in each step while there is a file with the name in the variable STALL.
-"""
+"""A simulator that allows one simulation in a process, as libsumo does. `fault` says what a second one does."""
 
 import os
 import time
@@ -43,8 +40,6 @@ class SingleInstance(gymnasium.Env):
 
     def step(self, action):
         time.sleep(self.step_s)
-        if self.fault == "stalls" and os.path.exists(os.environ.get("STALL", "")):
-            time.sleep(600)
         mover = simulations[-1] if self.fault == "shares" else self  # the state belongs to the newest simulation
         mover.position = np.float32(0.9 * mover.position + 0.1 * (int(action) - 1))
         return mover.position, -float(np.abs(mover.position).sum()), False, False, {}
@@ -58,7 +53,6 @@ for _name, _kwargs in {
     "Fails": {"fault": "fails"},
     "Hangs": {"fault": "hangs"},
     "Shares": {"fault": "shares"},
-    "Stalls": {"fault": "stalls"},
     "Slow": {"step_s": 0.005},
     "Many": {},
 }.items():

@@ -1,16 +1,12 @@
 """Runs whose environments are in processes of their own."""
 
-import os
-
 import pytest
 
-from helpers.listeners import AtStep, MessageListener
+from helpers.listeners import MessageListener
 from helpers.single_instance import N_STEPS, simulations, single_spec
 from helpers.training_runs import assert_equal_runs, resume_quietly, train_and_stop, train_quietly
 from lare_rl.envs import placement
 from lare_rl.envs.workers import _idle_workers
-from lare_rl.errors import LareError
-from lare_rl.runs.directory import open_run
 from lare_rl.training import train as training
 
 SEPARATE = single_spec("Fails", processes="separate")
@@ -49,17 +45,3 @@ def test_run_equals_one_in_a_single_process(settings, tmp_path, monkeypatch):
     assert_equal_runs(resume_quietly(tmp_path / "separate"), local)
     assert not simulations
     assert not any(_idle_workers.values())
-
-
-def test_hang_during_training(settings, tmp_path):
-    """It is an error of one line, after the last checkpoint."""
-    task = single_spec("Stalls", processes="separate", timeout=3)
-    stall = AtStep(50, lambda: (tmp_path / "stall").touch())
-    os.environ["STALL"] = str(tmp_path / "stall")
-    try:
-        with pytest.raises(LareError, match=r"environment 0 .* did not reply for 3 s in step; .* timeout") as error:
-            train_quietly(task, settings, tmp_path / "run", listeners=[stall])
-    finally:
-        del os.environ["STALL"]
-    assert "\n" not in str(error.value)
-    assert [line["step"] for line in open_run(tmp_path / "run").metrics()] == [30, 30]
