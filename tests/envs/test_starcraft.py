@@ -1,21 +1,15 @@
-"""SMAC through a mock of the game, whose battles are SMAX's."""
+"""SMAC through a stub of the game."""
 
 import sys
 from contextlib import nullcontext
-from dataclasses import replace
 from functools import partial
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.fake_smac import FROM_SMAC, FakeSmac, compiled_smax
+from helpers.fake_smac import FakeSmac
 from lare_rl.envs.starcraft import StarCraft
 from lare_rl.errors import LareError
-
-TO_SMAC = np.array([*(FROM_SMAC.index(action) for action in range(4)), 1, *range(6, 11)])
-"""The numbers of SMAX's actions in SMAC."""
 
 
 @pytest.fixture(autouse=True)
@@ -23,103 +17,83 @@ def no_launches():
     FakeSmac.launched = ()
 
 
-def sample_actions(timestep, rng) -> np.ndarray:
-    """Random available actions, one-hot."""
-    choices = np.argmax(timestep.available * rng.uniform(0.5, 1, timestep.available.shape), axis=1)
-    return np.eye(timestep.available.shape[1], dtype=np.float32)[choices]
+def make_game(*results) -> StarCraft:
+    return StarCraft("2s3z", make_env=partial(FakeSmac, results=iter(results)))
 
 
-def test_episode_equals_smax():
-    env, (_, reset, step) = StarCraft("2s3z", make_env=FakeSmac), compiled_smax("2s3z")
-    key, rng = jax.random.key(7), np.random.default_rng(0)
-    timestep = env.reset(7)
-    key, start_key = jax.random.split(key)
-    state, expected = reset(start_key)
+GOES_ON, LOST, WON = (
+    (1.0, False, {"battle_won": False}),
+    (1.0, True, {"battle_won": False}),
+    (1.0, True, {"battle_won": True}),
+)
+CRASH = (0.0, True, {})
+
+
+def play(env: StarCraft, seed: int, n_steps: int):
+    """Play the first available actions. Return all timesteps."""
+    timesteps = [env.reset(seed)]
+    for _ in range(n_steps):
+        timesteps.append(env.step(np.eye(3, dtype=np.float32)[timesteps[-1].available.argmax(axis=1)]))
+    return timesteps
+
+
+def test_episode():
+    """Arrays pass through. A dead unit is one that has only no-op, and earns nothing after the step in which it dies."""
+    env = make_game(GOES_ON, WON)
     spec = env.spec
     sizes = (spec.n_agents, spec.action_size, spec.max_steps, spec.observation_size, spec.state_size)
-    assert sizes == (5, 11, 120, 127, 120)
+    assert sizes == (2, 3, 3, 4, 5)
     assert (spec.discrete, spec.masks_actions, spec.agents_leave, spec.measures) == (True, True, True, ("won",))
-    steps, n_dead = 0, 0
-    while True:
-        available = timestep.available[timestep.alive][:, TO_SMAC]
-        np.testing.assert_array_equal(available, expected.available[expected.alive])
-        for values, smax_values in zip(timestep._replace(available=()), expected._replace(available=()), strict=True):
-            jax.tree.map(np.testing.assert_array_equal, values, smax_values)
-        if timestep.terminated or timestep.truncated:
-            break
-        action = sample_actions(timestep, rng)
-        assert (action[~timestep.alive].argmax(1) == 0).all()
-        n_dead += (~timestep.alive).sum()
-        choices = [FROM_SMAC[choice] if choice < 6 else choice - 1 for choice in action.argmax(1)]
-        timestep = env.step(action)
-        key, step_key = jax.random.split(key)
-        state, expected = step(state, jax.nn.one_hot(jnp.array(choices), 10), step_key)
-        steps += 1
-    assert steps > 10
-    assert n_dead > 0
+    timesteps = play(env, 7, 2)
+    for step, timestep in enumerate(timesteps):
+        np.testing.assert_array_equal(timestep.observation, np.float32([[10 + step] * 4, [20 + step] * 4]), strict=True)
+        np.testing.assert_array_equal(timestep.state, np.float32([step] * 5), strict=True)
+        assert timestep.available.tolist() == [
+            [False, True, True],
+            [True, False, False] if step else [False, True, False],
+        ]
+        assert timestep.alive.tolist() == [True, step == 0]
+        assert timestep.measures == {"won": step == 2}
+        assert (bool(timestep.terminated), bool(timestep.truncated)) == (step == 2, False)
+    assert [timestep.reward.tolist() for timestep in timesteps] == [[0, 0], [1, 1], [1, 0]]
 
 
-STOP = np.eye(11, dtype=np.float32)[[1] * 5]
-
-
-@pytest.mark.parametrize("won", [False, True])
-def test_time_limit(won):
+@pytest.mark.parametrize("end", [LOST, WON])
+def test_time_limit(end):
     """A battle that is won in the last step has terminated too."""
-
-    class Ending(FakeSmac):
-        def step(self, actions):
-            super().step(actions)
-            return 1.0, True, {"battle_won": won}
-
-    env = StarCraft("2s3z", make_env=Ending)
-    env.reset(0)
-    env.spec = replace(env.spec, max_steps=1)
-    timestep = env.step(STOP)
-    assert (bool(timestep.truncated), bool(timestep.terminated)) == (True, won)
+    *_, last = play(make_game(GOES_ON, GOES_ON, end), 0, 3)
+    assert (bool(last.truncated), bool(last.terminated)) == (True, end == WON)
 
 
 def test_crash_truncates_the_episode():
-    env = StarCraft("2s3z", make_env=partial(FakeSmac, crash_at=2))
-    env.reset(0)
-    previous = env.step(STOP)
+    env = make_game(GOES_ON, CRASH)
     with pytest.warns(RuntimeWarning, match="crashed in step 2"):
-        timestep = env.step(STOP)
-    assert (bool(timestep.truncated), bool(timestep.terminated)) == (True, False)
-    assert not timestep.reward.any()
-    np.testing.assert_array_equal(timestep.state, previous.state)
+        _, previous, last = play(env, 0, 2)
+    assert (bool(last.truncated), bool(last.terminated)) == (True, False)
+    assert not last.reward.any()
+    np.testing.assert_array_equal(last.state, previous.state)
     assert env.reset(1).alive.all()
     assert FakeSmac.launched == (0, 0, 1)
 
 
 def test_repeated_crashes_end_the_run():
     """A complete episode between crashes starts a new count."""
-    infos = iter([{}, {}, {"battle_won": False}, {}, {}, {}])  # at the end of each episode; a crash has none
-
-    class Ending(FakeSmac):
-        def step(self, actions):
-            super().step(actions)
-            self.ended = True
-            return 0.0, True, next(infos)
-
-    env = StarCraft("2s3z", make_env=Ending)
+    env = make_game(CRASH, CRASH, LOST, CRASH, CRASH, CRASH)
     for seed in range(5):
-        env.reset(seed)
         with nullcontext() if seed == 2 else pytest.warns(RuntimeWarning):
-            env.step(STOP)
-    env.reset(5)
+            play(env, seed, 1)
     with pytest.raises(LareError, match=r"crashed .* 3 times in a row"):
-        env.step(STOP)
+        play(env, 5, 1)
 
 
 def test_launches():
     """A new game is made only for the first episode, and again if that was incomplete."""
-    env, rng = StarCraft("2s3z", make_env=FakeSmac), np.random.default_rng(0)
-    timestep = env.reset(3)
-    while not (timestep.terminated or timestep.truncated):
-        timestep = env.step(sample_actions(timestep, rng))
+    env = make_game(LOST)
+    play(env, 3, 1)
     env.reset(4)
+    env.reset(5)
     assert FakeSmac.launched == (0, 3)
-    env = StarCraft("2s3z", make_env=FakeSmac)
+    env = make_game()
     env.reset(3)
     env.reset(4)
     assert FakeSmac.launched[2:] == (0, 3, 4)
@@ -128,11 +102,11 @@ def test_launches():
     env.close()
 
 
-def test_errors(write_package, monkeypatch, tmp_path):
-    env = StarCraft("2s3z", make_env=FakeSmac)
+def test_errors(monkeypatch):
+    env = make_game()
     env.reset(0)
     with pytest.raises(LareError, match=r"in a step of '2s3z': .*not available"):
-        env.step(np.eye(11, dtype=np.float32)[[0] * 5])
+        env.step(np.eye(3, dtype=np.float32)[[0, 0]])
     monkeypatch.setattr(FakeSmac, "render", lambda self, mode: 1 / 0)
     with pytest.raises(LareError, match="cannot draw '2s3z': division"):
         env.render()
@@ -143,37 +117,30 @@ def test_errors(write_package, monkeypatch, tmp_path):
     with pytest.raises(LareError, match=r"cannot make '2s3y': .*no map") as error:
         StarCraft("2s3y", make_env=fail)
     assert "\n" not in str(error.value)
-    write_package("smacv2")
-    write_package("smacv2/env", "raise TypeError('Descriptors cannot\\nbe created directly')")
-    monkeypatch.setenv("SC2PATH", str(tmp_path))
-    with pytest.raises(LareError, match="cannot be imported: Descriptors cannot"):
-        StarCraft("2s3z")
 
 
-@pytest.fixture
-def write_package(tmp_path, monkeypatch):
-    """Writes packages on the path, which Python forgets afterwards."""
+IMPORT = "from helpers.fake_smac import FakeSmac as StarCraft2Env"
+
+
+@pytest.mark.parametrize(
+    ("packages", "folder", "message"),
+    [
+        ({"smac": ""}, "", "not installed.* another project"),  # the one on PyPI
+        ({"smac": "", "smacv2": "", "smacv2/env": IMPORT}, "", None),
+        ({"smac": "", "smac/env": IMPORT, "smac/env/starcraft2": ""}, "", None),
+        ({"smacv2": "", "smacv2/env": IMPORT}, "nowhere", "nowhere.*SC2PATH"),
+        ({"smacv2": "", "smacv2/env": "raise TypeError('Descriptors\\ncannot')"}, "", "imported: Descriptors cannot"),
+    ],
+)
+def test_installed_game(packages, folder, message, monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(tmp_path)
-
-    def write(path: str, text: str = "") -> None:
-        file = tmp_path / path / "__init__.py"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(text)
-
-    yield write
-    for name in [name for name in sys.modules if name.split(".")[0] in ("smac", "smacv2")]:
-        del sys.modules[name]
-
-
-@pytest.mark.parametrize("packages", [("smacv2", "smacv2/env"), ("smac", "smac/env", "smac/env/starcraft2")])
-def test_installed_game(write_package, packages, monkeypatch, tmp_path):
-    write_package("smac")  # another project on PyPI
-    with pytest.raises(LareError, match=r"not installed.* another project"):
-        StarCraft("2s3z")
-    for package in packages:
-        write_package(package, "from helpers.fake_smac import FakeSmac as StarCraft2Env")
-    monkeypatch.setenv("SC2PATH", str(tmp_path / "nowhere"))
-    with pytest.raises(LareError, match=r"nowhere.*SC2PATH"):
-        StarCraft("2s3z")
-    monkeypatch.setenv("SC2PATH", str(tmp_path))
-    assert StarCraft("2s3z").spec.n_agents == 5
+    monkeypatch.setenv("SC2PATH", str(tmp_path / folder))
+    for path, text in packages.items():
+        (tmp_path / path).mkdir(exist_ok=True)
+        (tmp_path / path / "__init__.py").write_text(text)
+    try:
+        with pytest.raises(LareError, match=message) if message else nullcontext():
+            assert StarCraft("2s3z").spec.n_agents == 2
+    finally:
+        for name in [name for name in sys.modules if name.split(".")[0] in ("smac", "smacv2")]:
+            del sys.modules[name]

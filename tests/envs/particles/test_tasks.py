@@ -11,6 +11,7 @@ from envs.particles import twin as slow
 from helpers.long_tests import long_case
 from lare_rl.envs.particles.catalogue import TASKS, find_particle_task
 from lare_rl.envs.particles.navigation import N_LAYOUTS
+from lare_rl.envs.particles.particle_env import ParticleEnv
 from lare_rl.envs.particles.predator_prey import SIZES, logits, observe_preys, shipped_prey
 from lare_rl.envs.particles.task import MAX_STEPS
 from lare_rl.envs.particles.world import State, at_rest, move, push
@@ -83,6 +84,14 @@ def test_agents_in_the_same_place_stay_finite():
     world = TASKS["CN-6"].world
     state = move(world, at_rest(jnp.zeros((len(world.radius), 2))), push(world, jnp.zeros(world.n_moving, int)))
     np.testing.assert_array_equal(state.position, 0)
+
+
+def test_frames():
+    env = ParticleEnv("TriangleArea")
+    states, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 2))
+    pictures = [*env.frames(states), *env.frames(states, np.arange(6.0).reshape(2, 3))]
+    assert {(picture.shape, picture.dtype.name) for picture in pictures} == {((400, 400, 3), "uint8")}
+    assert len({picture.tobytes() for picture in pictures}) == 4
 
 
 # Where episodes start

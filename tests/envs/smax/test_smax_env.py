@@ -7,13 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.fake_smac import compiled_smax
 from helpers.long_tests import long_case
 from lare_rl.envs.interface import Timestep
 from lare_rl.envs.smax.battle import ATTACK, STOP
 from lare_rl.envs.smax.smax_env import SMAX, SmaxState
 
 BATTLES = 8
+
+
+@cache
+def compiled_smax(name: str):
+    """Return a SMAX environment, and its compiled `reset` and `step`."""
+    env = SMAX(name)
+    return env, jax.jit(env.reset), jax.jit(env.step)
 
 
 def sample_actions(env: SMAX, timestep: Timestep, key):
@@ -125,3 +131,12 @@ def test_time_limit():
     assert not timestep.truncated
     _, timestep = step(state, STOPS, jax.random.key(1))
     assert (bool(timestep.truncated), bool(timestep.terminated)) == (True, False)
+
+
+def test_frames():
+    env, _, step = compiled_smax("2s3z")
+    duel = make_duel(160, 160)
+    states = jax.tree.map(lambda *leaves: jnp.stack(leaves), duel, step(duel, ATTACKS, jax.random.key(0))[0])
+    pictures = [*env.frames(states), *env.frames(states, np.ones((2, 5)))]
+    assert {(picture.shape, picture.dtype.name) for picture in pictures} == {((400, 400, 3), "uint8")}
+    assert len({picture.tobytes() for picture in pictures}) == 4

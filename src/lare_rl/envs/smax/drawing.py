@@ -12,7 +12,7 @@ from lare_rl.envs.interface import Frame
 from lare_rl.envs.smax.battle import FIELD, Battle, attack_target
 from lare_rl.envs.smax.scenarios import Scenario
 
-__all__ = ["draw_frames", "find_hits", "paint_state"]
+__all__ = ["draw_frames"]
 
 DEAD_COLOUR = "#bbbbbb"
 
@@ -27,12 +27,12 @@ def draw_frames(scenario: Scenario, battles: Battle, credit: Float[np.ndarray, "
 
     def paint(axes: Axes, step: int) -> None:
         previous = states[step - 1] if step else None
-        paint_state(axes, scenario, states[step], previous, None if credit is None else float(credit[step]))
+        _paint_state(axes, scenario, states[step], previous, None if credit is None else float(credit[step]))
 
     return paint_frames(len(states), paint)
 
 
-def paint_state(axes: Axes, scenario: Scenario, battle: Battle, previous: Battle | None, credit: float | None) -> None:
+def _paint_state(axes: Axes, scenario: Scenario, battle: Battle, previous: Battle | None, credit: float | None) -> None:
     axes.set(xlim=(-0.5, FIELD + 0.5), ylim=(-0.5, FIELD + 0.5), aspect="equal")
     axes.axis("off")
     axes.add_patch(patches.Rectangle((0, 0), FIELD, FIELD, fill=False, edgecolor="#888888"))
@@ -48,7 +48,7 @@ def paint_state(axes: Axes, scenario: Scenario, battle: Battle, previous: Battle
         axes.add_patch(patches.Circle((x, y), radius, facecolor="white", edgecolor=colour, linewidth=1.2))
         axes.add_patch(patches.Wedge((x, y), radius, 90, 90 + 360 * float(health[unit]), facecolor=colour, alpha=0.8))
         axes.text(x, y, names[unit][0], fontsize=7, ha="center", va="center", color="black")
-    for shooter, target in find_hits(scenario, battle, previous) if previous else ():
+    for shooter, target in _find_hits(scenario, battle, previous) if previous else ():
         (x, y), (to_x, to_y) = battle.position[shooter], battle.position[target]
         axes.plot([x, to_x], [y, to_y], color=_side_colour(scenario, shooter), linewidth=1, alpha=0.7)
     label = f"step {int(battle.step)}" + ("" if credit is None else f"   credit {credit:.2g}")
@@ -59,7 +59,7 @@ def _side_colour(scenario: Scenario, unit: int) -> str:
     return OTHER_COLOUR if scenario.is_enemy[unit] else TEAM_COLOUR
 
 
-def find_hits(scenario: Scenario, battle: Battle, previous: Battle) -> list[tuple[int, int]]:
+def _find_hits(scenario: Scenario, battle: Battle, previous: Battle) -> list[tuple[int, int]]:
     """Return the pairs (unit, its target) of the hits of a step. A unit has hit if its cooldown rose; otherwise it falls."""
     target = np.asarray(attack_target(scenario, jnp.asarray(battle.action)))
     fired = np.asarray(battle.cooldown) > np.asarray(previous.cooldown)
