@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 
 from helpers.host_envs import ToyHostEnv
-from helpers.jax_toy_envs import Echo
 from helpers.toy_envs import toy_spec
-from lare_rl.envs.families import find_score_type, make_env, make_local_env, register_family
+from lare_rl.envs.families import make_env, register_family
 from lare_rl.envs.interface import EnvSpec, Team
-from lare_rl.envs.jax_on_host import JaxOnHost
-from lare_rl.envs.load import read_task
 from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
@@ -99,11 +96,6 @@ def test_keys_without_effect_are_refused(environment, key):
         make_env(toy_spec(environment=environment, **{key: KEYS[key]}))
 
 
-def test_score_of_a_task_comes_before_its_family():
-    tasks = read_task("SMAX-2s3z"), toy_spec(environment="smax/2s3z", score="average"), toy_spec()
-    assert list(map(find_score_type, tasks)) == ["sum", "average", None]
-
-
 # Agreement of a task and its environment
 
 
@@ -148,47 +140,8 @@ def test_tasks_that_do_not_agree(changes, content):
 # Making environments
 
 
-class Drawn(Echo):
-    """A `JaxEnv` that has the functions of a `HostEnv` too."""
-
-    def __init__(self, task):
-        super().__init__()
-
-    def render(self): ...
-
-    def close(self): ...
-
-
-def test_jax_env_with_the_functions_of_a_host_env():
-    register_family("drawn", Drawn)
-    sizes = {"observation_size": Echo.spec.observation_size, "action_size": Echo.spec.action_size}
-    assert isinstance(make_local_env(toy_spec(environment="drawn/x", **sizes)), JaxOnHost)
-
-
 def make_toy_task(**changes) -> TaskSpec:
     return toy_spec(**{"environment": "logged/two", "action_size": 2} | changes)
-
-
-class Incomplete:
-    """An environment without the functions of its kind."""
-
-    def __init__(self, task):
-        self.spec = replace(HUNT, is_jax=task.name_in_family == "jax")
-
-    def reset(self, key): ...
-
-    def step(self, state, action, key): ...
-
-
-register_family("incomplete", Incomplete)
-
-
-@pytest.mark.parametrize(
-    ("name", "words"), [("jax", "JaxEnv .* no frames"), ("host", "HostEnv .* no render and no close")]
-)
-def test_missing_functions_are_named(name, words):
-    with pytest.raises(LareError, match=words):
-        make_env(make_task(environment=f"incomplete/{name}"))
 
 
 def test_sizes_are_read_once(log):

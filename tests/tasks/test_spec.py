@@ -23,6 +23,14 @@ def test_names_that_are_no_directory(name):
     assert toy_spec(name=".a-1").name == ".a-1"
 
 
+def test_equal_tasks():
+    """The order of arguments makes no difference."""
+    first, second = (team_spec(arguments=dict.fromkeys(keys, 1)) for keys in ("ab", "ba"))
+    assert (first, hash(first)) == (second, hash(second))
+    assert first != team_spec()
+    assert toy_spec().digest == toy_spec().digest != toy_spec(description="another").digest
+
+
 def test_measures_are_no_metrics_of_evaluations():
     with pytest.raises(LareError, match="'length'"):
         toy_spec(measures=("speed", "length"))
