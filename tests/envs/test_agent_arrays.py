@@ -34,18 +34,6 @@ def test_decode_action(space, vector, action):
     assert space.contains(decoded)
 
 
-def test_bounds_and_available_actions_are_padded():
-    continuous = AgentArrays(
-        [agent(action=Box(-3, 4, (2,), np.float32)), agent("b_0", action=Box(0, 5, (1,), np.float32))]
-    )
-    low, high = continuous.bounds
-    assert (low.tolist(), high.tolist()) == ([[-3, -3], [0, 0]], [[4, 4], [5, 0]])
-    assert continuous.available.tolist() == [[True, True]] * 2
-    discrete = AgentArrays([agent(action=Discrete(2)), agent("b_0", action=Discrete(3))])
-    assert discrete.available.tolist() == [[True, True, False], [True, True, True]]
-    assert [bound.shape for bound in discrete.bounds] == [(2, 0), (2, 0)]
-
-
 @settings(deadline=None, max_examples=40)
 @given(
     value=st.lists(st.floats() | st.integers() | st.none() | st.text(max_size=2), max_size=3)
