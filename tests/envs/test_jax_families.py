@@ -1,12 +1,14 @@
-"""What the families of other packages' JAX environments share: refusals, missing packages, pictures and drafts."""
+"""What the families of other packages' JAX environments share: steps, time limits, refusals, missing packages, pictures and drafts."""
 
 import sys
+from itertools import islice
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.jax_families import family_task, require_family
+from helpers.jax_families import check_arrays, family_task, play, require_family, step_keys
 from helpers.long_tests import long_case
 from lare_rl.envs.families import make_env
 from lare_rl.errors import LareError, install_command
@@ -15,6 +17,95 @@ from lare_rl.new_task.single_agent import draft_task
 pytestmark = pytest.mark.filterwarnings("ignore:Accessing .* directly from:DeprecationWarning")
 
 CARTPOLE, TAG, KNAPSACK = "gymnax/CartPole-v1", "jaxmarl/MPE_simple_tag_v3", "jumanji/Knapsack-v1"
+
+# Steps. Each function yields the observations and rewards of all agents, whether the episode has terminated, and the mask of actions.
+
+
+def replay_gymnax(env, actions, reset_key, keys):
+    observation, state = env.reset_env(reset_key, env.default_params)
+    yield observation, 0.0, False, True
+    for action, key in zip(actions, keys, strict=True):
+        observation, state, reward, done, _ = env.step_env(key, state, action[0].argmax(), env.default_params)
+        yield observation, reward, done, True
+
+
+def replay_knapsack(env, actions, reset_key, keys):
+    state, timestep = env.reset(reset_key)
+    for action in [*actions, actions[-1]]:
+        observation, mask = timestep.observation, np.array(timestep.observation.action_mask)
+        mask[0] |= not mask.any()
+        arrays = np.concatenate([observation.weights, observation.values, observation.packed_items])
+        yield arrays, timestep.reward, timestep.last() and timestep.discount == 0, mask
+        state, timestep = env.step(state, jnp.int32(action[0].argmax()))
+
+
+def replay_jaxmarl(env, actions, reset_key, keys):
+    observations, state = env.reset(reset_key)
+    yield np.stack([observations[name] for name in env.agents]), 0.0, False, True
+    for action, key in zip(actions, keys, strict=True):
+        choices = dict(zip(env.agents, jnp.int32(action.argmax(axis=1)), strict=True))
+        observations, state, reward, _, _ = env.step_env(key, state, choices)
+        yield *(np.stack([values[name] for name in env.agents]) for values in (observations, reward)), False, True
+
+
+def replay_robot(env, actions, reset_key, keys):
+    state, step = jax.jit(env.reset)(reset_key), jax.jit(env.step)
+    yield state.obs, 0.0, False, True
+    for action in actions:
+        state = step(state, jnp.asarray(action[0]))
+        yield state.obs, state.reward, state.done, True
+
+
+@pytest.mark.parametrize(
+    ("environment", "sizes", "changes", "replay", "ends"),
+    [
+        (CARTPOLE, (4, 2), {}, replay_gymnax, True),
+        (KNAPSACK, (150, 50), {"max_episode_steps": 50}, replay_knapsack, True),
+        ("jaxmarl/MPE_simple_spread_v3", (18, 5), {}, replay_jaxmarl, False),
+        long_case(
+            "brax/inverted_pendulum",
+            (4, 1),
+            {"max_episode_steps": 30, "arguments": {"backend": "spring"}},
+            replay_robot,
+            True,
+        ),
+        long_case("playground/PendulumSwingup", (3, 1), {"arguments": {"episode_length": 3}}, replay_robot, False),
+    ],
+)
+def test_steps_equal_those_of_the_package(environment, sizes, changes, replay, ends):
+    """Up to the terminal state, which is observed, or up to the time limit, which truncates."""
+    require_family(environment)
+    env = make_env(family_task(environment, *sizes, **changes))
+    n_steps = min(env.spec.max_steps, 60)
+    first, actions, timesteps = play(env, 2, n_steps)
+    check_arrays(env.spec, timesteps)
+    timesteps = jax.tree.map(lambda start, later: np.concatenate([start[:1], later[0]]), first, timesteps)
+    assert timesteps.terminated.any() == ends
+    n_compared = 1 + (int(timesteps.terminated.argmax()) if ends else n_steps)
+    steps = replay(env.env, actions[0], *step_keys(2, n_steps))
+    for number, (observation, reward, terminated, available) in enumerate(islice(steps, n_compared)):
+        np.testing.assert_allclose(timesteps.observation[number].squeeze(), observation, rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(timesteps.reward[number].squeeze(), reward, rtol=1e-3, atol=1e-4)
+        assert timesteps.terminated[number] == terminated
+        assert (timesteps.available[number] == available).all()
+        assert timesteps.truncated[number] == (number == env.spec.max_steps)
+
+
+@pytest.mark.parametrize(
+    ("environment", "sizes", "measure"),
+    [(CARTPOLE, (4, 2), "discount"), ("jumanji/Game2048-v1", (16, 4), "highest_tile")],
+)
+def test_time_limit_of_a_task_truncates(environment, sizes, measure):
+    require_family(environment)
+    env = make_env(family_task(environment, *sizes, max_episode_steps=3, measures=[measure]))
+    assert env.spec.max_steps == 3
+    _, _, timesteps = play(env, 2, 3)
+    np.testing.assert_array_equal(timesteps.truncated, [[False, False, True]] * 2)
+    assert not timesteps.terminated.any()
+    assert (timesteps.measures[measure] >= 1).all()
+
+
+# Other packages that are missing, or that do not fit
 
 
 @pytest.mark.parametrize(
@@ -47,7 +138,7 @@ def test_refusals(environment, changes, content):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("family", ["gymnax", "brax", "playground", "jumanji", "jaxmarl"])
+@pytest.mark.parametrize("family", ["gymnax", "playground"])
 def test_missing_package(family, monkeypatch):
     package = "mujoco_playground" if family == "playground" else family
     for name in [name for name in sys.modules if name == package or name.startswith(f"{package}.")]:

@@ -1,11 +1,10 @@
-"""Environments of JaxMARL, compared with its own steps."""
+"""Environments of JaxMARL. `test_jax_families.py` compares them with its own steps."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.jax_families import check_arrays, family_task, play, require_family, step_keys
+from helpers.jax_families import check_arrays, family_task, play, require_family
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import Team
 from lare_rl.envs.jaxmarl_env import make
@@ -13,32 +12,11 @@ from lare_rl.errors import LareError
 
 require_family("jaxmarl")
 
-SPREAD = "jaxmarl/MPE_simple_spread_v3"
 TAG = "jaxmarl/MPE_simple_tag_v3"
 
 
 def tag_team(name: str):
     return family_task(TAG, 20, 5, name=name, agents=[f"{name}_*"], team=name)
-
-
-def test_time_limit_truncates_and_keeps_the_last_observation():
-    env = make(family_task(SPREAD))
-    assert (env.spec.teams, env.spec.max_steps, env.spec.observation_size) == ((Team("agent", 0, 3),), 25, 18)
-    _, actions, timesteps = play(env, 2, 25)
-    check_arrays(env.spec, timesteps)
-    np.testing.assert_array_equal(timesteps.truncated, [np.arange(25) == 24] * 2)
-    assert not timesteps.terminated.any()
-    assert timesteps.alive.all()
-    reset_key, keys = step_keys(2, 25)
-    _, state = env.env.reset(reset_key)
-    observations, rewards = {}, 0.0
-    for number in range(25):
-        choices = {name: jnp.int32(actions[0, number, index].argmax()) for index, name in enumerate(env.env.agents)}
-        observations, state, reward, _, _ = env.env.step_env(keys[number], state, choices)
-        rewards += reward["agent_1"]
-    last = np.stack([observations[name] for name in env.env.agents])
-    np.testing.assert_allclose(timesteps.observation[0, -1], last, rtol=1e-3, atol=1e-4)
-    assert timesteps.reward[0, :, 1].sum() == pytest.approx(float(rewards), rel=1e-3)
 
 
 def test_teams_and_padding():

@@ -1,4 +1,4 @@
-"""The adapter of Brax and Playground: on a toy with the same functions, and compared with their own steps."""
+"""The adapter of Brax and Playground, on a toy with the same functions. `test_jax_families.py` compares it with their own steps."""
 
 from typing import Any, NamedTuple
 
@@ -7,13 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.jax_families import check_arrays, family_task, play, require_family, step_keys
-from helpers.long_tests import long_case
-from lare_rl.envs.families import make_env
+from helpers.jax_families import check_arrays, family_task, play
 from lare_rl.envs.robot_env import adapt_robot
 from lare_rl.errors import LareError
-
-pytestmark = pytest.mark.filterwarnings("ignore:Accessing .* directly from:DeprecationWarning")
 
 
 class ToyState(NamedTuple):
@@ -81,38 +77,3 @@ def test_ends_and_sums():
     np.testing.assert_array_equal(timesteps.reward[:, 0], [3, 7, 11, 15])
     with pytest.raises(LareError, match="observes pixels/view_0, but not 'state'"):
         make_toy(keys=("pixels/view_0",))
-
-
-@pytest.mark.parametrize(
-    ("environment", "arguments", "sizes", "ends"),
-    [
-        long_case("brax/inverted_pendulum", {"backend": "spring"}, (4, 1, 30), True),
-        long_case("playground/PendulumSwingup", {"episode_length": 3}, (3, 1, 3), False),
-    ],
-)
-def test_last_observation_is_the_terminal_state(environment, arguments, sizes, ends):
-    require_family(environment)
-    limit, n_steps = (30 if ends else None), sizes[2]
-    env = make_env(family_task(environment, *sizes[:2], max_episode_steps=limit, arguments=arguments))
-    assert (env.spec.observation_size, env.spec.action_size, env.spec.max_steps) == sizes
-    first, actions, timesteps = play(env, 2, n_steps)
-    check_arrays(env.spec, timesteps)
-    np.testing.assert_array_equal(timesteps.truncated, [np.arange(n_steps) == n_steps - 1] * 2)
-    assert timesteps.terminated[0].any() == ends
-    last = int(timesteps.terminated[0].argmax()) if ends else n_steps - 1
-    assert not ends or abs(timesteps.observation[0, last, 0, 1]) > 0.2  # the pole has fallen
-    state, step, rewards = jax.jit(env.env.reset)(step_keys(2, n_steps)[0]), jax.jit(env.env.step), 0.0
-    np.testing.assert_allclose(first.observation[0, 0], state.obs, rtol=1e-4, atol=1e-5)
-    for action in actions[0, : last + 1, 0]:
-        state = step(state, jnp.asarray(action))
-        rewards += float(state.reward)
-    np.testing.assert_allclose(timesteps.observation[0, last, 0], state.obs, rtol=1e-3, atol=1e-4)
-    assert timesteps.reward[0, : last + 1].sum() == pytest.approx(rewards, rel=1e-3)
-
-
-@pytest.mark.parametrize("environment", ["brax/halfcheetah", long_case("playground/CheetahRun")])
-def test_deprecated_attributes_of_a_model_write_no_log(environment, tmp_path, monkeypatch):
-    require_family(environment)
-    monkeypatch.chdir(tmp_path)
-    make_env(family_task(environment, 17, 6))
-    assert list(tmp_path.iterdir()) == []
