@@ -50,11 +50,6 @@ def test_no_cache(variables):
     assert cache_variables(variables) == {}
 
 
-def test_home_directory(tmp_path, monkeypatch):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert Path(cache_variables({"LARE_CACHE": "~/own"})["JAX_COMPILATION_CACHE_DIR"]).parent == tmp_path / "own"
-
-
 def test_incomplete_programs_are_removed(tmp_path):
     environment = {"LARE_CACHE": str(tmp_path)}
     directory = Path(cache_variables(environment)["JAX_COMPILATION_CACHE_DIR"])
