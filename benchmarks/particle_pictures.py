@@ -8,9 +8,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from PIL import Image
 
 from lare_rl.envs.particles.catalogue import find_particle_task
-from lare_rl.envs.particles.drawing import draw_state
+from lare_rl.envs.particles.drawing import draw_frames
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 
@@ -23,7 +24,8 @@ def main() -> None:
         state = task.reset(jax.random.key(seed))
         for key in jax.random.split(jax.random.key(seed), 6):
             state = task.step(state, action, key)
-        draw_state(task, np.asarray(state.position)).savefig(PICTURES / f"{name}.png", dpi=60)
+        (frame,) = draw_frames(task, np.asarray(state.position)[None])
+        Image.fromarray(frame).resize((240, 240)).save(PICTURES / f"{name}.png")
 
 
 if __name__ == "__main__":

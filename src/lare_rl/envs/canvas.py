@@ -16,23 +16,16 @@ except ImportError as missing:
 
 from lare_rl.envs.interface import Frame
 
-__all__ = [
-    "OTHER_COLOUR", "TEAM_COLOUR", "Axes", "Figure", "blank_figure", "colormaps", "paint_frames", "patches", "to_pixels",
-]  # fmt: skip
+__all__ = ["OTHER_COLOUR", "TEAM_COLOUR", "Axes", "colormaps", "paint_frames", "patches", "to_pixels"]
 
 TEAM_COLOUR, OTHER_COLOUR = "#0072b2", "#d55e00"
 """The colours of the first team, and of the others that move."""
 
 
-def blank_figure() -> tuple[Figure, Axes]:
-    """Make an empty picture of 400 by 400 pixels."""
-    figure = Figure(figsize=(4, 4), dpi=100)
-    return figure, figure.add_axes((0, 0, 1, 1))
-
-
 def paint_frames(n_frames: int, paint: Callable[[Axes, int], None]) -> list[Frame]:
-    """Return pictures. `paint` draws the picture with an index on empty axes."""
-    figure, axes = blank_figure()
+    """Return pictures of 400 by 400 pixels. `paint` draws the picture with an index on empty axes."""
+    figure = Figure(figsize=(4, 4), dpi=100)
+    axes = figure.add_axes((0, 0, 1, 1))
     frames = []
     for index in range(n_frames):
         axes.clear()

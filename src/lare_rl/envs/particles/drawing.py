@@ -1,15 +1,13 @@
-"""Pictures of particle tasks: of a state, and of all steps of an episode."""
-
-from collections.abc import Callable
+"""Pictures of particle tasks."""
 
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.canvas import OTHER_COLOUR, TEAM_COLOUR, Axes, Figure, blank_figure, colormaps, paint_frames, patches
+from lare_rl.envs.canvas import OTHER_COLOUR, TEAM_COLOUR, Axes, colormaps, paint_frames, patches
 from lare_rl.envs.interface import Frame
 from lare_rl.envs.particles.task import ParticleTask
 
-__all__ = ["draw_frames", "draw_state"]
+__all__ = ["draw_frames"]
 
 LANDMARK_COLOUR = "#9a9a9a"
 """The colour of entities that do not move."""
@@ -18,34 +16,20 @@ MARGIN = 1.08
 """The size of the picture relative to the square of all entities."""
 
 
-def draw_state(
-    task: ParticleTask, position: Float[np.ndarray, "entities 2"], credit: Float[np.ndarray, " agents"] | None = None
-) -> Figure:
-    """Draw a state, to scale. Each agent's credit is a number and a colour."""
-    figure, axes = blank_figure()
-    _make_painter(task, position[None], None if credit is None else credit[None])(axes, 0)
-    return figure
-
-
 def draw_frames(
     task: ParticleTask,
     positions: Float[np.ndarray, "steps entities 2"],
     credit: Float[np.ndarray, "steps agents"] | None = None,
 ) -> list[Frame]:
-    """Draw an episode as pictures with common scales of length and of credit."""
-    return paint_frames(len(positions), _make_painter(task, positions, credit))
-
-
-def _make_painter(
-    task: ParticleTask,
-    positions: Float[np.ndarray, "steps entities 2"],
-    credit: Float[np.ndarray, "steps agents"] | None,
-) -> Callable[[Axes, int], None]:
-    """Return a function that draws the state of a step, with the scales of all steps."""
+    """Draw an episode as pictures with common scales of length and of credit. Each agent's credit is a number and a colour."""
     outermost = np.abs(positions) + task.world.radius[:, None]
     side = float(MARGIN * max(task.half_side, outermost.max()))
     scale = 0.0 if credit is None else float(np.abs(credit).max())
-    return lambda axes, step: _paint(axes, task, positions[step], side, None if credit is None else credit[step], scale)
+
+    def paint(axes: Axes, step: int) -> None:
+        _paint(axes, task, positions[step], side, None if credit is None else credit[step], scale)
+
+    return paint_frames(len(positions), paint)
 
 
 def _paint(

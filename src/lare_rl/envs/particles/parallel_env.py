@@ -93,10 +93,9 @@ class ParticleParallelEnv(ParallelEnv[str, Any, Any]):
         return self._by_agent(observations), self._by_agent(rewards), *ends, {agent: {} for agent in acted}
 
     def render(self) -> np.ndarray:
-        from lare_rl.envs.canvas import to_pixels
-        from lare_rl.envs.particles.drawing import draw_state
+        from lare_rl.envs.particles.drawing import draw_frames
 
-        return to_pixels(draw_state(self.task, np.asarray(self._require_world().position)))
+        return draw_frames(self.task, np.asarray(self._require_world().position)[None])[0]
 
     def state(self) -> np.ndarray:
         """Return the positions and velocities of all entities, in one vector."""
