@@ -60,9 +60,9 @@ def make_table(task: Task, rollouts: Rollouts, features: str = "events") -> Turn
 class Progress:
     """The credit of `TurnCredit`, and the lambdas that it used."""
 
-    def __init__(self, features: str, lambda_: float | None, *, logistic: bool = False, agent_stops: bool = True):
+    def __init__(self, features: str, lambda_: float | None, *, agent_stops: bool = True):
         self.features, self.agent_stops = features, agent_stops
-        self.credit = TurnCredit(lambda_, logistic=logistic)
+        self.credit = TurnCredit(lambda_)
         self.lambdas: list[float] = []
 
     def __call__(self, task: Task, rollouts: Rollouts, theta: Float[np.ndarray, "inputs actions"]) -> Turns:
@@ -101,7 +101,6 @@ METHODS: dict[str, Callable[[], Credit]] = {
     "progress 0.8, tool x error": partial(Progress, "tool x error", 0.8),
     "progress 0, events": partial(Progress, "events", 0.0),
     "exact advantages": lambda: lambda task, rollouts, theta: task.truth(theta, rollouts).advantage,
-    "progress 0.8, logistic, events": partial(Progress, "events", 0.8, logistic=True),
     "progress, guarded, no stops, events": partial(Progress, "events", None, agent_stops=False),
     "progress, guarded, no stops, generic": partial(Progress, "generic", None, agent_stops=False),
 }

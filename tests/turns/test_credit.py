@@ -120,7 +120,6 @@ def test_gain_is_a_ratio_of_sums():
         ({"lambda_": 1.5}, [1], "lambda_ .*0 to 1.* 1.5"),
         ({"lambda_": float("nan")}, [1], "lambda_ .*nan"),
         ({"window": 0}, [1], "window = 0.*1 or more"),
-        ({"logistic": True}, [3.0, 1.0], "between 0 and 1"),
         ({}, [], "no rollouts"),
     ],
 )

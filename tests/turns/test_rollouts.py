@@ -203,16 +203,12 @@ NUMBERS = st.dictionaries(st.sampled_from("abc"), st.floats(-1e9, 1e9) | st.samp
         st.tuples(st.lists(NUMBERS, min_size=1, max_size=6), st.floats(-1e6, 1e6), st.integers(0, 3)),
         min_size=1,
         max_size=12,
-    ),
-    st.booleans(),
+    )
 )
-def test_any_numbers_give_exact_sums(rollouts, is_binary):
-    outcomes = [float(outcome > 0) if is_binary else outcome for _, outcome, _ in rollouts]
-    result = lare_rl.TurnCredit(0.8, logistic=is_binary)(
-        [
-            {"turns": turns, "outcome": outcome, "group": group}
-            for (turns, _, group), outcome in zip(rollouts, outcomes, strict=True)
-        ]
+def test_any_numbers_give_exact_sums(rollouts):
+    outcomes = [outcome for _, outcome, _ in rollouts]
+    result = lare_rl.TurnCredit(0.8)(
+        [{"turns": turns, "outcome": outcome, "group": group} for turns, outcome, group in rollouts]
     )
     scale = 1 + max(map(abs, outcomes))
     for outcome, progress, value in zip(outcomes, result.progress, result.value, strict=True):

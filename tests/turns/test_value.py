@@ -5,9 +5,8 @@ import pytest
 
 from helpers.turn_toys import dense_posterior, sample_table, slow_prefix
 from lare_rl.turns.features import build_prefixes
-from lare_rl.turns.logistic import logistic
 from lare_rl.turns.regression import PrefixFit
-from lare_rl.turns.value import advantages, changes, fit_prefixes, held_out_values, posterior_stds, values
+from lare_rl.turns.value import advantages, changes, held_out_values, posterior_stds, values
 
 ALPHA, BETA = 2.0, 5.0
 
@@ -47,7 +46,6 @@ def linear_fit(table, x):
         group_row=rows,
         group_precision=precision,
         noise_variance=1 / BETA,
-        is_logistic=False,
     )
 
 
@@ -117,39 +115,3 @@ def test_posterior_stds_are_those_of_the_posterior(problem):
         steps = [np.concatenate([step, np.zeros(1 + n_groups)]) for step in np.diff(rows, axis=0)]
         expected = [np.sqrt(row @ covariance @ row) for row in [*steps, last]]
         np.testing.assert_allclose(result[rows_of(table, k)], expected, rtol=1e-6)
-
-
-def test_logistic_values_are_probabilities_and_follow_the_outcomes():
-    random = np.random.default_rng(0)
-    table = sample_table(n_groups=40)
-    index = table.rollout_index
-    happened = np.bincount(index, table.features[:, 0]) > 0
-    chance = logistic(2.0 * happened - 1 + random.normal(size=40)[table.group])
-    table = table._replace(outcome=(random.random(len(chance)) < chance).astype(float))
-    x = build_prefixes(table).features
-    fit = fit_prefixes(table, x, is_logistic=True)
-    value = values(table, x, fit)
-    assert (value > 0).all()
-    assert (value < 1).all()
-    # The gradient of the posterior is 0 in the direction of m: the weighted residuals add up to 0.
-    eta = fit.mean + (x - fit.x_mean) @ fit.weight + fit.intercept[table.group][index]
-    assert abs(np.mean(table.outcome[index] - logistic(eta))) < 1e-3
-    linear = values(table, x, fit_prefixes(table, x))
-    assert np.corrcoef(value, linear)[0, 1] > 0.9
-    assert np.isfinite(posterior_stds(table, x, fit)).all()
-
-
-def test_held_out_logistic_values_are_near_those_of_a_fit_without_the_rollout():
-    table = sample_table(n_groups=30, seed=3)
-    table = table._replace(outcome=(table.outcome > np.median(table.outcome)).astype(float))
-    x = build_prefixes(table).features
-    fit = fit_prefixes(table, x, is_logistic=True)
-    held_out = held_out_values(table, x, fit)
-    rows, n = rows_of(table, 0), table.length[0]
-    smaller = table._replace(
-        features=table.features[n:],
-        **{name: getattr(table, name)[1:] for name in ("length", "outcome", "group", "truncated")},
-    )
-    again = fit_prefixes(smaller, x[n:], is_logistic=True)
-    expected = logistic(again.mean + (x[rows] - again.x_mean) @ again.weight + again.intercept[table.group[0]])
-    np.testing.assert_allclose(held_out[rows], expected, atol=0.05)

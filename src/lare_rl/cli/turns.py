@@ -19,7 +19,6 @@ def turn_credit(
     report: Annotated[Path | None, tyro.conf.arg(metavar="PAGE")] = None,
     function: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     lambda_: Annotated[float | None, tyro.conf.arg(name="lambda", metavar="FLOAT")] = None,
-    logistic: bool = False,
     overwrite: bool = False,
 ) -> None:
     """Give each turn of an agent's rollouts its credit, from the outcomes of the rollouts. Says how far to trust it.
@@ -34,7 +33,6 @@ def turn_credit(
         report: a page to write: some rollouts as strips of turns, the effects of features, and how far to trust the credit.
         function: a phi over turns (.py): it reads each turn and names its events.
         lambda_: of generalized advantages, 0 to 1. The default is measured: 0.8, 0.95 or 1.
-        logistic: model the log odds of outcomes between 0 and 1.
         overwrite: replace --out and --report if they exist.
     """
     from lare_rl.turns.credit import TurnCredit
@@ -49,7 +47,7 @@ def turn_credit(
         if report.resolve() == out.resolve():
             raise LareError(f"--out writes {out} too: choose another --report")
     phi = None if function is None else load_turn_phi(function)
-    credit = TurnCredit(lambda_, logistic=logistic)
+    credit = TurnCredit(lambda_)
     contents = read_rollout_file(rollouts)
     checked = read_rollouts(contents, phi)
     result = credit.assign(tabulate(checked))

@@ -31,7 +31,7 @@ TurnValues = list[Float[np.ndarray, " _"]]
 
 
 class FeatureEffect(NamedTuple):
-    """How a feature of a turn changes the value, in the unit of outcomes (of log odds if values are logistic).
+    """How a feature of a turn changes the value, in the unit of outcomes.
 
     Each effect is that of a feature of the size `unit`, and has its posterior standard deviation.
     """
@@ -75,8 +75,6 @@ class CreditedTurns:
     """The gain, its standard error, and the surprise at the end, over the latest calls."""
     effects: tuple[FeatureEffect, ...]
     """One for each feature of a turn."""
-    is_logistic: bool
-    """Whether the effects are changes of log odds."""
     reason: Finding
     """Why this lambda was used."""
 
@@ -105,13 +103,10 @@ class CreditedTurns:
         """The same as findings, whose sentences are in `turns/words.py`."""
         clear = [effect for effect in self.effects if abs(effect.first) > CLEAR_ERRORS * effect.first_std]
         clear.sort(key=lambda effect: -effect.importance)
-        target, decimals = "log odds" if self.is_logistic else "value", count_decimals(self.trust.outcome_std)
+        decimals = count_decimals(self.trust.outcome_std)
         return [
             Finding("grpo" if self.is_grpo else "lambda", {"lambda_": self.lambda_, "reason": self.reason}),
-            *(
-                Finding("effect", {**effect._asdict(), "target": target, "decimals": decimals})
-                for effect in clear[:MAX_SENTENCES]
-            ),
+            *(Finding("effect", {**effect._asdict(), "decimals": decimals}) for effect in clear[:MAX_SENTENCES]),
         ]
 
 
@@ -121,15 +116,12 @@ class TurnCredit:
     Each call fits the values of prefixes anew, to its own rollouts. Only the errors of the last `window` calls are remembered.
     """
 
-    def __init__(
-        self, lambda_: float | None = None, *, window: int = 20, logistic: bool = False, phi: Phi | None = None
-    ):
+    def __init__(self, lambda_: float | None = None, *, window: int = 20, phi: Phi | None = None):
         """Make an object that has seen no rollouts.
 
         Args:
             lambda_: of generalized advantages, 0 to 1. None: the trust in the values decides between 0.8, 0.95 and 1.
             window: the number of calls over which trust is measured.
-            logistic: whether the log odds of outcomes are linear in the features, and not the value. Outcomes are then 0 to 1.
             phi: a function from a turn to numbers with names, such as `load_turn_phi` reads. It needs rollouts with messages.
 
         Raises:
@@ -137,7 +129,7 @@ class TurnCredit:
         """
         if lambda_ is not None and not (isinstance(lambda_, int | float | np.number) and 0 <= lambda_ <= 1):
             raise LareError(f"lambda_ must be None or a number from 0 to 1, and is {short_repr(lambda_)}")
-        self.lambda_, self.window, self.logistic, self.phi = lambda_, check_count("window", window), logistic, phi
+        self.lambda_, self.window, self.phi = lambda_, check_count("window", window), phi
         self._errors: tuple[Errors, ...] = ()
 
     def __call__(self, rollouts: Iterable[Any]) -> CreditedTurns:
@@ -153,16 +145,10 @@ class TurnCredit:
 
     @one_blas_thread()
     def assign(self, table: TurnTable) -> CreditedTurns:
-        """Return the credit of turns that are arrays already.
-
-        Raises:
-            LareError: the values are logistic, and an outcome is not between 0 and 1.
-        """
-        if self.logistic and not np.all((table.outcome >= 0) & (table.outcome <= 1)):
-            raise LareError("logistic values need outcomes between 0 and 1: use logistic=False, or scale the outcomes")
+        """Return the credit of turns that are arrays already."""
         prefixes = build_prefixes(table)
         x = prefixes.features
-        fit = fit_prefixes(table, x, is_logistic=self.logistic)
+        fit = fit_prefixes(table, x)
         value = values(table, x, fit)
         progress = changes(table, value)
         errors = measure_errors(table, held_out_values(table, x, fit))
@@ -184,7 +170,6 @@ class TurnCredit:
             lambda_=float(lambda_),
             trust=trust,
             effects=_describe_effects(table, prefixes, fit),
-            is_logistic=self.logistic,
             reason=reason,
         )
 

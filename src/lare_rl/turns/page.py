@@ -35,7 +35,6 @@ NOTE_DEVIATIONS = (
     "The error bars are two posterior standard deviations. They contain the exact change of value in only about half of the turns, "
     "because they leave out what the features miss. If an error bar does not reach 0, the sign of the progress is usually right."
 )
-NOTE_LOGISTIC = "Effects are changes of the log odds of the outcome."
 
 
 def write_turn_report(
@@ -64,7 +63,6 @@ def write_turn_report(
         "<ul>" + "".join(f"<li>{line}</li>" for line in effects) + "</ul>"
         if effects
         else render_note("No feature of a turn changes the value clearly."),
-        render_note(NOTE_LOGISTIC) if credit.is_logistic else "",
         _render_effects(credit),
         "<h2>Some rollouts</h2>",
         render_note(NOTE_DEVIATIONS),

@@ -34,7 +34,6 @@ __all__ = [
     "fixed_point",
     "group_moments",
     "sum_up",
-    "to_fit",
 ]
 
 MAX_ROUNDS = 40
@@ -74,9 +73,7 @@ class PrefixFit(NamedTuple):
     group_precision: Float[np.ndarray, " groups"]
     """D: the precision of b if (v, m) is known."""
     noise_variance: float
-    """1 / beta, the variance of e. 1 if `is_logistic`."""
-    is_logistic: bool
-    """Whether m + b + v . (x - x') is the log odds of the outcome (`logistic.py`)."""
+    """1 / beta, the variance of e."""
 
 
 def sum_up(
@@ -85,9 +82,8 @@ def sum_up(
     weight: Float[np.ndarray, " prefixes"],
     group: Int[np.ndarray, " prefixes"],
     n_rollouts: int,
-    unit: float | None = None,
 ) -> GroupSums:
-    """Return the sums over prefixes, with the outcomes y in `unit`, or else in their standard deviation.
+    """Return the sums over prefixes, with the outcomes y in units of their standard deviation.
 
     Groups without a prefix are allowed. The degrees of freedom are those of the rollouts, because all prefixes of a rollout have the
     same outcome.
@@ -97,7 +93,7 @@ def sum_up(
     x_centred, y_centred = x - x_mean, y - y_mean
     size = np.maximum(np.abs(x).max(axis=0, initial=0), 1e-300)  # features of turns are not standardised
     x_centred = np.where(varies(weight @ (x_centred / size) ** 2 / total, (x_mean / size) ** 2), x_centred, 0)
-    y_std = unit or np.sqrt(weight @ y_centred**2 / total)
+    y_std = np.sqrt(weight @ y_centred**2 / total)
     if not y_std > 1e-9 * np.abs(y).max(initial=0):
         y_std, y_centred = 0.0, np.zeros_like(y)
     weighted = weight[:, None] * x_centred
@@ -114,7 +110,7 @@ def sum_up(
     problem = Regression(
         s=s,
         p=np.concatenate([scaled @ x_centred, group_y]),
-        q=total,  # the sum of w y^2 in a linear fit, where y has the variance 1
+        q=total,  # the sum of w y^2, because y has the variance 1
         dof=np.asarray(n_rollouts - 1.0),
         y_mean=y_mean,
         y_std=np.asarray(y_std),
@@ -191,22 +187,16 @@ def fit_linear(
     candidates = [fixed_point(sums, problem.equal_alpha * factor, beta) for factor in (1.0, NOISE_ONLY)]
     best = max(candidates, key=lambda posterior: posterior.log_evidence)
     alpha, beta = NUMPY_BACKEND.clip_precisions(problem, best.alpha, best.beta)
-    return to_fit(sums, eliminate_groups(sums, alpha, beta), float(beta), is_logistic=False)
-
-
-def to_fit(sums: GroupSums, posterior: Elimination, beta: float, *, is_logistic: bool) -> PrefixFit:
-    """Return a posterior in the unit of the outcomes or, if `is_logistic`, of log odds."""
-    unit = float(sums.problem.y_std)
+    posterior, unit = eliminate_groups(sums, alpha, beta), float(problem.y_std)
     return PrefixFit(
         x_mean=sums.x_mean,
         weight=unit * posterior.weight[:-1],
-        mean=float(sums.problem.y_mean + unit * posterior.weight[-1]),
+        mean=float(problem.y_mean + unit * posterior.weight[-1]),
         intercept=unit * posterior.intercept,
         root=unit * posterior.root,
         group_row=posterior.group_row,
         group_precision=posterior.group_precision / (unit or 1) ** 2,
-        noise_variance=(unit or 1) ** 2 / beta,
-        is_logistic=is_logistic,
+        noise_variance=(unit or 1) ** 2 / float(beta),
     )
 
 

@@ -32,7 +32,7 @@ MESSAGES = {
         "by {surprise:+.{decimals}f} when agents stop"
     ),
     "effect": (
-        "The first `{name}` changes the {target} by {first:+.{decimals}f} ± {first_std:.{decimals}f}, and by "
+        "The first `{name}` changes the value by {first:+.{decimals}f} ± {first_std:.{decimals}f}, and by "
         "{lasting:+.{decimals}f} ± {lasting_std:.{decimals}f} after further turns without it. Each further one adds "
         "{further:+.{decimals}f} ± {further_std:.{decimals}f}."
     ),
