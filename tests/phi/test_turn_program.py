@@ -5,13 +5,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lare_rl.phi.limits import MAX_TEXT_LENGTH, RefusedError
-from lare_rl.phi.turn_program import read_turn_program, shorten
+from lare_rl.phi.turn_program import parse_turn_program, read_events, shorten
 
 HEAD = "def turn_events(tool, arguments, result, text):\n"
 
 
 def events(body, tool="test", arguments=None, result="3 failed, 25 passed in 1.5s", text="I run the tests."):
-    return read_turn_program(HEAD + body).events(tool, arguments or {}, result, text)
+    return read_events(parse_turn_program(HEAD + body), tool, arguments or {}, result, text)
 
 
 @pytest.mark.parametrize(
@@ -39,8 +39,8 @@ def test_arguments_are_copied():
 
 
 def test_nothing_is_kept_between_calls():
-    program = read_turn_program("seen = []\n" + HEAD + "    seen.append(tool)\n    return {'seen': len(seen)}\n")
-    assert [program.events("a", {}, "", "")["seen"] for _ in range(3)] == [1, 1, 1]
+    tree = parse_turn_program("seen = []\n" + HEAD + "    seen.append(tool)\n    return {'seen': len(seen)}\n")
+    assert [read_events(tree, "a", {}, "", "")["seen"] for _ in range(3)] == [1, 1, 1]
 
 
 def test_long_texts_are_shortened_in_the_middle():
@@ -78,7 +78,7 @@ def test_long_texts_are_shortened_in_the_middle():
 )
 def test_refusals(source, words):
     with pytest.raises(RefusedError) as error:
-        read_turn_program(source).events("test", {}, "ok", "")
+        read_events(parse_turn_program(source), "test", {}, "ok", "")
     assert all(word in str(error.value) for word in words), str(error.value)
     assert "\n" not in str(error.value)
 
@@ -97,7 +97,7 @@ def test_any_program_gives_numbers_or_a_refusal(pieces, result, arguments):
     source = HEAD + f"    return {{'a': {' '.join(pieces)}}}\n"
     refusal, values = "", {}
     try:
-        values = read_turn_program(source).events("test", arguments, result, "")
+        values = read_events(parse_turn_program(source), "test", arguments, result, "")
     except RefusedError as error:
         refusal = str(error)
     assert "E-BUG" not in refusal

@@ -30,12 +30,12 @@ OTHER_NAMES = "def turn_events(tool, arguments, result, text):\n    return {'a' 
 
 
 def test_calls_of_a_turn_have_the_same_events():
-    assert find_problems(OTHER_NAMES, [PASSED, FAILED]).startswith(
+    assert find_problems(read_turn_phi(OTHER_NAMES), [PASSED, FAILED]).startswith(
         "E-NAMES call 2: the events are not those of call 1 (a, b)"
     )
     calls = [{"function": {"name": "test", "arguments": arguments}} for arguments in ('{"a": 1}', "{}")]
     messages = [{"role": "assistant", "content": "I look."}, {"role": "assistant", "tool_calls": calls}]
-    with pytest.raises(LareError, match="rollout 0, turn 1: the phi over turns failed: E-NAMES call 2"):
+    with pytest.raises(LareError, match="rollout 0, turn 1: phi failed: E-NAMES call 2"):
         lare_rl.TurnCredit(phi=read_turn_phi(OTHER_NAMES))([{"messages": messages, "outcome": 1}])
 
 
@@ -57,7 +57,6 @@ def test_credit_uses_the_events():
 @pytest.mark.parametrize(
     ("source", "words"),
     [
-        ("def turn_events(", ["E-SYNTAX"]),
         (SOURCE.replace("len(arguments)", "1 / len(arguments)"), ["E-RUN"]),
         (
             "def turn_events(tool, arguments, result, text):\n    return {'a' if tool else 'b': 1}\n",
@@ -67,9 +66,9 @@ def test_credit_uses_the_events():
     ],
 )
 def test_problems(source, words):
-    problems = find_problems(source, [Turn("", PASSED.calls[:1], ""), FAILED])
+    problems = find_problems(read_turn_phi(source), [Turn("", PASSED.calls[:1], ""), FAILED])
     assert all(word in problems for word in words), problems
-    assert find_problems(SOURCE, [PASSED, FAILED]) == ""
+    assert find_problems(read_turn_phi(SOURCE), [PASSED, FAILED]) == ""
 
 
 def test_files(tmp_path):
@@ -91,14 +90,16 @@ def test_design_corrects_until_a_program_passes(tmp_path):
         to_reply(source) for source in ("x = 1", SOURCE.replace("def turn_events", "def f") + ALIAS, RAISE, SOURCE)
     ]
     model = ScriptedModel(replies=["no JSON", *replies])
+    path = tmp_path / "record.json"
     half = Turn("\ud83d", (), "")  # half of a surrogate pair, which no file can hold
-    designed = design_turn_phi("\ud83d", [{"name": "test"}], [PASSED, half], model, record=tmp_path / "record.json")
-    assert designed.phi.source.strip() == SOURCE.strip()
+    phi = design_turn_phi("\ud83d", [{"name": "test"}], [PASSED, half], model, record=path)
+    assert phi.source.strip() == SOURCE.strip()
     assert "not one JSON object" in model.requests[1][-1]["content"]
     assert "E-FORM" in model.requests[2][-1]["content"]
     assert "no function turn_events" in model.requests[3][-1]["content"]
     assert "ValueError: ?" in model.requests[4][-1]["content"]
-    assert [exchange.stage for exchange in designed.recorder.exchanges] == ["candidate", *["correct"] * 4]
+    exchanges = read_recording(path.read_text(encoding="utf-8"), path.name).exchanges
+    assert [exchange.stage for exchange in exchanges] == ["candidate", *["correct"] * 4]
 
 
 def test_request_has_tools_and_turns():
@@ -116,9 +117,9 @@ def test_tool_sets_and_their_recorded_replies(name):
     tool_set = load_tool_set(name)
     assert len(tool_set.examples) == 5
     phi = load_turn_phi(ROOT / "examples" / "phi" / f"turns_{name}.py")
-    assert find_problems(phi.source, tool_set.turns) == ""
+    assert find_problems(phi, tool_set.turns) == ""
     path = SHIPPED_RECORDINGS / "events" / f"{name}.draw0.json"
     recording = read_recording(path.read_text(encoding="utf-8"), path.name)
     model = RecordedModel([recording], name)
-    designed = design_turn_phi(tool_set.goal, tool_set.tools, tool_set.turns, model, examples=tool_set.examples)
-    assert designed.model == f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"
+    phi = design_turn_phi(tool_set.goal, tool_set.tools, tool_set.turns, model, examples=tool_set.examples)
+    assert phi.model == f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"

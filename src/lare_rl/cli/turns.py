@@ -103,10 +103,10 @@ def turn_phi(
     record = None if out is None else out.with_suffix(".json")
     live_model = live.open(model)
     with after_requests("turns", live_model, live):
-        designed = design_turn_phi(goal, descriptions, turns, live_model, record=record)
-    text = f"# A phi over turns, by {one_line(designed.model)}.\n{designed.phi.source}\n".encode()
+        phi = design_turn_phi(goal, descriptions, turns, live_model, record=record)
+    text = f"# A phi over turns, by {one_line(phi.model)}.\n{phi.source}\n".encode()
     if out is None:
-        print_source(designed.phi.source, lambda path: write_bytes(path, text), find_free_path(Path(), "turns", ".py"))
+        print_source(phi.source, lambda path: write_bytes(path, text), find_free_path(Path(), "turns", ".py"))
         return
     write_bytes(out, text)
     print_line(f"wrote {out} and {record}")

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError, check_count
@@ -17,7 +17,12 @@ from lare_rl.llm.recording import Recorder
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec, require_role
 
-__all__ = ["Conversation", "DesignError", "check_recorded", "design", "examine_reply", "keep_replies"]
+__all__ = [
+    "Conversation", "DesignError", "ask_and_record", "check_recorded", "correct_until_passing", "design", "examine_reply",
+    "keep_replies",
+]  # fmt: skip
+
+_Result = TypeVar("_Result")
 
 
 class DesignError(LareError):
@@ -46,6 +51,48 @@ def keep_replies(recorder: Recorder, model: Model) -> Iterator[None]:
         raise DesignError(str(error) or "stopped", recorder, model.name, status) from error
 
 
+def ask_and_record(model: Model, recorder: Recorder, stage: Stage, messages: Sequence[Message]) -> str:
+    """Return a new reply to a request."""
+    reply = ask(model, messages, recorder.n_replies(stage, messages))
+    recorder.add(stage, messages, reply, model.name)
+    return reply
+
+
+def correct_until_passing(
+    model: Model,
+    recorder: Recorder,
+    request: list[Message],
+    reply: str,
+    examine: Callable[[str], tuple[_Result, str]],
+    on_message: Callable[[str], None] = lambda _: None,
+) -> _Result:
+    """Examine the reply to a request, and ask for corrections until one has no errors.
+
+    Args:
+        examine: returns what a reply says, and its errors, which are empty if it passes.
+
+    Raises:
+        DesignError: no attempt has passed.
+    """
+    result, errors = examine(reply)
+    for number in range(1, MAX_ATTEMPTS + 1):
+        on_message(f"attempt {number}: {_summarise(errors)}")
+        if not errors:
+            return result
+        if number < MAX_ATTEMPTS:
+            request = prompts.correct(request, reply, errors)
+            reply = ask_and_record(model, recorder, "correct", request)
+            result, errors = examine(reply)
+    reason = f"none of {MAX_ATTEMPTS} attempts passed; the last one failed: {_summarise(errors)}"
+    raise DesignError(f"task {recorder.task!r}: {reason}", recorder, model.name)
+
+
+def _summarise(errors: str) -> str:
+    """Return the first error and the number of the others, in one line; "passes" if there is none."""
+    first, *others = errors.splitlines() or ["passes"]
+    return first + (f" (and {len(others)} more)" if others else "")
+
+
 class Attempt(NamedTuple):
     """A reply, and the result of its verification."""
 
@@ -53,12 +100,6 @@ class Attempt(NamedTuple):
     source: str
     """It is empty if the reply could not be read."""
     verdict: Verdict
-
-    @property
-    def outcome(self) -> str:
-        """The first error and the number of the others, in one line; "passes" if there is none."""
-        lines = self.verdict.errors.splitlines() or ["passes"]
-        return lines[0] + (f" (and {len(lines) - 1} more)" if len(lines) > 1 else "")
 
 
 def examine_reply(reply: str, task: TaskSpec, kind: FunctionKind, steps: Steps | None = None) -> Attempt:
@@ -84,9 +125,7 @@ class Conversation:
 
     def ask(self, stage: Stage, messages: Sequence[Message]) -> str:
         """Return a new reply to a request."""
-        reply = ask(self.model, messages, self.recorder.n_replies(stage, messages))
-        self.recorder.add(stage, messages, reply, self.model.name)
-        return reply
+        return ask_and_record(self.model, self.recorder, stage, messages)
 
     def start(self, candidates: int, pre_verification: bool) -> tuple[list[Message], str]:
         """Ask for candidates and their combination. Return the last request and the reply to it.
@@ -101,28 +140,26 @@ class Conversation:
         if pre_verification:
             attempts = [self._examine(reply) for reply in replies]
             for number, attempt in enumerate(attempts, start=1):
-                self.on_message(f"candidate {number}: {attempt.outcome}")
+                self.on_message(f"candidate {number}: {_summarise(attempt.verdict.errors)}")
             passing = [attempt.reply for attempt in attempts if attempt.verdict.passed]
         request = prompts.combine(self.task, passing or list(map(prompts.quote, replies)), self.kind)
         return request, self.ask("combine", request)
 
     def correct(self, request: list[Message], reply: str) -> Attempt:
         """Verify a reply, and ask for corrections until one passes. Raises `DesignError` if no attempt has passed."""
-        attempt = self._examine(reply)
-        for number in range(1, MAX_ATTEMPTS + 1):
-            self.on_message(f"attempt {number}: {attempt.outcome}")
-            if attempt.verdict.passed:
-                return attempt
-            if number < MAX_ATTEMPTS:
-                request = prompts.correct(request, attempt.reply, attempt.verdict.errors)
-                attempt = self._examine(self.ask("correct", request))
-        raise self._error(f"none of {MAX_ATTEMPTS} attempts passed; the last one failed: {attempt.outcome}")
+
+        def examine(reply: str) -> tuple[Attempt, str]:
+            attempt = self._examine(reply)
+            return attempt, attempt.verdict.errors
+
+        return correct_until_passing(self.model, self.recorder, request, reply, examine, self.on_message)
 
     def accept(self, reply: str) -> Attempt:
         """Accept a reply that can be read: the ablation without pre-verification. Raises `DesignError` if it cannot be read."""
         attempt = self._examine(reply)
         if attempt.verdict.graph is None:
-            raise self._error(f"the reply cannot be read: {attempt.outcome}")
+            reason = f"the reply cannot be read: {_summarise(attempt.verdict.errors)}"
+            raise DesignError(f"task {self.task.name!r}: {reason}", self.recorder, self.model.name)
         return attempt._replace(verdict=Verdict((Check("read", True),), attempt.verdict.graph))
 
     def to_function(self, attempt: Attempt) -> LatentFunction:
@@ -136,9 +173,6 @@ class Conversation:
 
     def _examine(self, reply: str) -> Attempt:
         return examine_reply(reply, self.task, self.kind, self.steps)
-
-    def _error(self, reason: str) -> DesignError:
-        return DesignError(f"task {self.task.name!r}: {reason}", self.recorder, self.model.name)
 
 
 def check_recorded(task: TaskSpec, kind: FunctionKind, draw: int, candidates: int) -> None:

@@ -12,7 +12,6 @@ import ast
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from lare_rl.errors import short_repr
@@ -24,10 +23,11 @@ from lare_rl.phi.runtime import Meter
 from lare_rl.phi.values import Bound, Function, describe
 from lare_rl.util.sanitize import one_line
 
-__all__ = ["TURN_FUNCTION_NAME", "TurnProgram", "read_turn_program", "shorten"]
+__all__ = ["NO_FUNCTION", "TURN_FUNCTION_NAME", "parse_turn_program", "read_events", "shorten"]
 
 TURN_FUNCTION_NAME = "turn_events"
 """The name of the function that a program must define."""
+NO_FUNCTION = f"there is no function {TURN_FUNCTION_NAME}(tool, arguments, result, text)"
 MAX_STEPS = 150_000  # for one call; a method of a text takes a step for each of its characters
 MAX_NAME_LENGTH = 60  # of an event
 MAX_EVENT_VALUE = 1e6
@@ -39,54 +39,47 @@ OMISSION = "\n... (the middle of a long text is left out) ...\n"
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d{1,300}(?:\.\d{1,300})?|\.\d{1,300})(?:[eE][-+]?\d{1,3})?(?!\d)")
 
 
-@dataclass(frozen=True)
-class TurnProgram:
-    """A parsed program. It runs only when it reads a turn."""
-
-    source: str
-    tree: ast.Module
-
-    def events(self, tool: str, arguments: Mapping[str, Any], result: str, text: str) -> dict[str, float]:
-        """Return the events of one call: names and numbers.
-
-        The program sees texts of more than `MAX_TEXT_LENGTH` characters without their middle, at most `MAX_ARGUMENTS` entries of a list
-        or a dictionary, and "..." for what is nested deeper than `MAX_ARGUMENT_DEPTH`.
-
-        Args:
-            tool: the name of the tool; empty if none was called.
-            arguments: the arguments of the call.
-            result: what the tool answered, or without a tool what the user did.
-            text: what the assistant said.
-
-        Raises:
-            RefusedError: the program fails, costs too much, or returns something else. The message has a line for its author.
-        """
-        with building(builder := Builder()):
-            interpreter = Interpreter(builder, MAX_STEPS)
-            interpreter.module["find_numbers"] = Bound(lambda value: _find_numbers(interpreter.meter, value))
-            inputs = [shorten(tool), _copy_argument(dict(arguments)), shorten(result), shorten(text)]
-            try:
-                interpreter.run(self.tree.body, interpreter.module)
-                function = interpreter.module.get(TURN_FUNCTION_NAME)
-                if not isinstance(function, Function):
-                    signature = f"{TURN_FUNCTION_NAME}(tool, arguments, result, text)"
-                    raise RefusedError("E-FORM", f"there is no function {signature}")
-                return _check_events(interpreter.call(function, inputs, {}))
-            except Exception as error:  # no text may stop the process that reads it
-                refusal = located_refusal(error, interpreter)
-        raise refusal
-
-
-def read_turn_program(source: str) -> TurnProgram:
+def parse_turn_program(source: str) -> ast.Module:
     """Parse a program. Other errors appear when it reads turns.
 
     Raises:
         RefusedError: the text is not Python, too long or nested too deep, or has invisible characters.
     """
     try:
-        return TurnProgram(source, parse(source))
+        return parse(source)
     except RefusedError as refusal:
         raise RefusedError(refusal.code, refusal.located(refusal.line or 1), refusal.line) from None
+
+
+def read_events(tree: ast.Module, tool: str, arguments: Mapping[str, Any], result: str, text: str) -> dict[str, float]:
+    """Return the events of one call: names and numbers.
+
+    The program sees texts of more than `MAX_TEXT_LENGTH` characters without their middle, at most `MAX_ARGUMENTS` entries of a list
+    or a dictionary, and "..." for what is nested deeper than `MAX_ARGUMENT_DEPTH`.
+
+    Args:
+        tree: the parsed program.
+        tool: the name of the tool; empty if none was called.
+        arguments: the arguments of the call.
+        result: what the tool answered, or without a tool what the user did.
+        text: what the assistant said.
+
+    Raises:
+        RefusedError: the program fails, costs too much, or returns something else. The message has a line for its author.
+    """
+    with building(builder := Builder()):
+        interpreter = Interpreter(builder, MAX_STEPS)
+        interpreter.module["find_numbers"] = Bound(lambda value: _find_numbers(interpreter.meter, value))
+        inputs = [shorten(tool), _copy_argument(dict(arguments)), shorten(result), shorten(text)]
+        try:
+            interpreter.run(tree.body, interpreter.module)
+            function = interpreter.module.get(TURN_FUNCTION_NAME)
+            if not isinstance(function, Function):
+                raise RefusedError("E-FORM", NO_FUNCTION)
+            return _check_events(interpreter.call(function, inputs, {}))
+        except Exception as error:  # no text may stop the process that reads it
+            refusal = located_refusal(error, interpreter)
+    raise refusal
 
 
 def shorten(text: str, length: int = MAX_TEXT_LENGTH) -> str:

@@ -3,16 +3,16 @@
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from lare_rl.errors import LareError
-from lare_rl.latent.design import DesignError, keep_replies
+from lare_rl.latent.design import ask_and_record, correct_until_passing, keep_replies
 from lare_rl.latent.function import normalise_source
-from lare_rl.llm.model import Model, ModelFunction, as_model, ask
-from lare_rl.llm.prompts import MAX_ATTEMPTS, Message, correct
+from lare_rl.llm.model import Model, ModelFunction, as_model
+from lare_rl.llm.prompts import Message
 from lare_rl.llm.recording import Recorder
 from lare_rl.llm.reply import parse_reply
 from lare_rl.phi.turn_program import shorten
@@ -20,23 +20,12 @@ from lare_rl.turns.messages import Turn, read_function, to_json
 from lare_rl.turns.phi import TurnPhi, find_problems, read_turn_phi
 from lare_rl.util.sanitize import replace_surrogates
 
-__all__ = ["DesignedTurnPhi", "choose_examples", "design_turn_phi", "turn_request"]
+__all__ = ["choose_examples", "design_turn_phi", "turn_request"]
 
 N_EXAMPLES = 5
 """The number of turns that `choose_examples` returns at most."""
 MAX_EXCERPT = 1500
 """The number of characters that are shown of each text of an example, at most."""
-
-
-@dataclass(frozen=True)
-class DesignedTurnPhi:
-    """A phi over turns, and where it comes from."""
-
-    phi: TurnPhi
-    model: str
-    """The name of the language model."""
-    recorder: Recorder
-    """The requests and the replies."""
 
 
 def design_turn_phi(
@@ -47,7 +36,7 @@ def design_turn_phi(
     *,
     examples: Sequence[Turn] | None = None,
     record: str | Path | None = None,
-) -> DesignedTurnPhi:
+) -> TurnPhi:
     """Ask a model for a phi over turns until one passes.
 
     Args:
@@ -68,21 +57,19 @@ def design_turn_phi(
     request = turn_request(goal, tools, choose_examples(turns) if examples is None else examples)
     path = None if record is None else Path(record)
     recorder = Recorder("turns", "events", getattr(model, "temperature", None), path)
-    problems = ""
-    for attempt in range(MAX_ATTEMPTS):
-        with keep_replies(recorder, model):
-            reply = ask(model, request)
-        recorder.add("correct" if attempt else "candidate", request, reply, model.name)
+
+    def examine(reply: str) -> tuple[TurnPhi | None, str]:
         try:
-            source = normalise_source(parse_reply(reply).functions)
-            problems = find_problems(source, turns)
-            if not problems:
-                return DesignedTurnPhi(read_turn_phi(source), model.name, recorder)
+            phi = read_turn_phi(normalise_source(parse_reply(reply).functions))
         except LareError as error:
-            problems = str(error)
-        request = correct(request, reply, replace_surrogates(problems))
-    reason = f"none of {MAX_ATTEMPTS} attempts passed; the last one failed: {problems.splitlines()[0]}"
-    raise DesignError(reason, recorder, model.name)
+            return None, replace_surrogates(str(error))
+        return phi, replace_surrogates(find_problems(phi, turns))
+
+    with keep_replies(recorder, model):
+        reply = ask_and_record(model, recorder, "candidate", request)
+        phi = correct_until_passing(model, recorder, request, reply, examine)
+    assert phi is not None  # because it has passed
+    return replace(phi, model=model.name)
 
 
 def turn_request(goal: str, tools: Sequence[Mapping[str, Any]], turns: Sequence[Turn]) -> list[Message]:

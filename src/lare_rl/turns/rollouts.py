@@ -118,7 +118,7 @@ def _evaluate(phi: Phi, turns: Sequence[Turn], where: str) -> list[Row]:
         try:
             events = phi(turn)
         except LareError as error:
-            raise LareError(f"{where}, turn {t}: {error}") from error
+            raise LareError(f"{where}, turn {t}: phi failed: {error}") from error
         except Exception as error:  # phi is the user's function
             raise LareError(f"{where}, turn {t}: phi failed: {type(error).__name__}: {one_line(error)}") from error
         rows.append(_read_row(events, f"the result of phi for turn {t}", where))
