@@ -3,8 +3,8 @@
 The episodes are played for this purpose, or come from the replay of a finished run.
 """
 
+import math
 from collections.abc import Callable, Sequence
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,9 +18,12 @@ from lare_rl.credit.input_names import raw_feature_names
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.play import Episode, Policy, play_episodes
 from lare_rl.errors import LareError, check_count
-from lare_rl.latent.function import LatentFunction
-from lare_rl.latent.improve import Assessment, improve
+from lare_rl.latent.design import Conversation
+from lare_rl.latent.function import LatentFunction, normalise_source
+from lare_rl.llm import prompts
 from lare_rl.llm.model import Model, ModelFunction, as_model
+from lare_rl.llm.recording import Exchange, Recorder
+from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.runs.directory import Run, as_run
 from lare_rl.tasks.spec import TaskSpec, require_role, select_sides
 from lare_rl.training.stored_episodes import stored_role_episodes
@@ -64,18 +67,54 @@ def reflect(
             its own function.
     """
     role, model, rounds = require_role(resolve_task(task)), as_model(model), check_count("rounds", rounds)
-
-    @cache
-    def load_episodes() -> Sequence[Episode]:
+    exchanges = [Exchange(**exchange) for exchange in function.exchanges]
+    path = None if record is None else Path(record)
+    recorder = Recorder(role.name, function.kind, getattr(model, "temperature", None), path, exchanges)
+    conversation = Conversation(role, function.kind, model, recorder, on_message)
+    try:
         if episodes is None:
-            return play_episodes(role, N_EPISODES, policy)
-        return stored_role_episodes(as_run(episodes), role) if isinstance(episodes, Run | str | Path) else episodes
+            episodes = play_episodes(role, N_EPISODES, policy)
+        elif isinstance(episodes, Run | str | Path):
+            episodes = stored_role_episodes(as_run(episodes), role)
+        best, assessment = function, assess_function(function, role, episodes)
+        if math.isnan(assessment.r2):
+            raise LareError(
+                "the returns of all episodes are equal, and no function can predict them better than another"
+            )
+    except (LareError, KeyboardInterrupt) as error:
+        on_message(f"no reflection: {str(error) or 'stopped'}")
+        return function
+    on_message(f"reflection: the factors of the first function predict unseen returns with R² = {assessment.r2:.3f}")
+    for number in range(1, rounds + 1):
+        try:
+            evidence = "\n".join([*assessment.ranges, *assessment.sentences])
+            request = prompts.reflect(role, _find_reply(best), evidence, function.kind)
+            attempt = conversation.correct(request, conversation.ask("reflect", request))
+            candidate = conversation.to_function(attempt)
+            candidate_assessment = assess_function(candidate, role, episodes)
+        except LareError as error:
+            on_message(f"reflection {number}: {error}")
+            continue
+        except KeyboardInterrupt:
+            on_message(f"reflection {number}: stopped")
+            break
+        is_better = candidate_assessment.r2 > assessment.r2
+        on_message(f"reflection {number}: R² = {candidate_assessment.r2:.3f}, {'kept' if is_better else 'not better'}")
+        if is_better:
+            best, assessment = candidate, candidate_assessment
+    return conversation.add_exchanges(best)
 
-    def judge(function: LatentFunction) -> Assessment:
-        assessment = assess_function(function, role, load_episodes())
-        return Assessment(assessment.r2, "\n".join([*assessment.ranges, *assessment.sentences]))
 
-    return improve(function, role, model, judge, rounds, record, on_message)
+def _find_reply(function: LatentFunction) -> str:
+    """Return the reply that a function was read from, or its source if no reply fits."""
+    replies = [reply for exchange in function.exchanges for reply in exchange["replies"]]
+    for reply in reversed(replies):
+        try:
+            if normalise_source(parse_reply(reply).functions) == function.source:
+                return reply
+        except MalformedReplyError:
+            continue
+    return function.source
 
 
 class FunctionAssessment(NamedTuple):
