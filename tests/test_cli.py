@@ -186,10 +186,7 @@ def test_new_task_of_two_teams(command, tmp_path):
     status, out, err = command("new-task", "pettingzoo/mpe2.simple_adversary_v3:parallel_env")
     assert (status, err) == (0, "")
     files = [f"simple_adversary_v3{team}.toml" for team in ("", "-adversary", "-agent")]
-    first, heading, sentence, *_ = out.splitlines()
-    assert first == f"wrote {', '.join(files)}"
-    assert "rewards" in heading
-    assert "reward" in sentence
+    assert out.splitlines()[:2] == [f"wrote {', '.join(files)}", "  its first lines say what was left out, if anything"]
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(files)
     for name in files[1:]:
         assert f"lare-rl design {name} --model NAME" in out
@@ -200,14 +197,6 @@ def test_new_task_of_two_teams(command, tmp_path):
     for options, words in (((), "choose another folder"), (("--out", files[2]), "of a team")):
         assert words in command("new-task", "pettingzoo/mpe2.simple_adversary_v3:parallel_env", *options)[2]
         assert sorted(path.name for path in tmp_path.iterdir()) == files[1:]
-
-
-def test_new_task_without_documentation(command):
-    out = command("new-task", "Hopper-v4", "--out", "a hopper.toml")[1]
-    assert "lare-rl design 'a hopper.toml' --model" in out
-    assert re.findall(r"fill in: (\w+) ", out) == ["description", "observation", "action"]
-    out = command("new-task", "helpers.toy_envs:toys/Endless-v0", "--out", "endless.toml")[1]
-    assert re.findall(r"fill in: (\w+) ", out)[-1] == "max_episode_steps"
 
 
 def test_design(command, tmp_path):

@@ -89,10 +89,5 @@ class Capitals(Toy):
         super().__init__(("Hunter_0", "Prey_0"), **more)
 
 
-class OddNames(Toy):
-    def __init__(self, **more):
-        super().__init__(("red team_0", 'bl"/ue_0', "😀_0"), **more)
-
-
 class OtherCapitals(Capitals):
     """The same in which policies are evaluated."""

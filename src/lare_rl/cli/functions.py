@@ -74,21 +74,12 @@ def new_task(
     for new, text in zip(paths, [draft.toml, *draft.teams.values()], strict=True):
         write_bytes(new, text.encode())
     print_line(f"wrote {', '.join(map(str, paths))}")
-    if draft.removed:
-        print_line("  left out or cut short, because it seems to speak of rewards:")
-    for sentence in draft.removed:
-        print_line(f"    {sentence}")
-    if draft.unused_sections:
-        print_line(f"  sections of the documentation that were not used: {', '.join(draft.unused_sections)}")
+    print_line("  its first lines say what was left out, if anything")
     where = f" of {', '.join(map(str, paths))}" if draft.teams else ""
     for key in draft.missing_keys:
         print_line(
             f"  fill in: {key}{where} ({'the log' if draft.logs_only else 'the environment'} does not document it)"
         )
-    if not draft.lists_entries:
-        print_line("  check: observation (its entries are not described one by one)")
-    if draft.guesses_limit:
-        print_line("  fill in: max_episode_steps (a guess: the environment has no limit of its own)")
     data = ["--data", environment] if draft.logs_only else []
     roles = [(str(file), f"phi_{file.stem}.py") for file in paths[1:]] or [(str(path), "phi.py")]
     for role_path, function_path in roles:

@@ -32,7 +32,7 @@ def draft_log_task(source: Any) -> Draft:
         f"max_episode_steps = {limit}" if limit else LIMIT_LINE,
     ]
     first_lines = {key: _first_line(layout, key) for key, layout in layouts.items()}
-    return make_draft(name, lines, texts, first_lines, removed, logs_only=True)
+    return make_draft(name, lines, texts, first_lines, logs_only=True)
 
 
 def _first_line(layout: SpaceLayout, key: str) -> str:

@@ -1,7 +1,6 @@
 """A draft of a task file, and the lines that all drafts have."""
 
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,7 +8,7 @@ from typing import Any
 import gymnasium
 from gymnasium.spaces import Box, Discrete
 
-from lare_rl.tasks.spec import FILL_IN, entry_meanings
+from lare_rl.tasks.spec import FILL_IN
 from lare_rl.util.sanitize import one_line
 
 __all__ = [
@@ -43,8 +42,8 @@ GROUP_LINE = (
 
 DEFAULT_LIMIT = 1000
 LIMIT_LINE = (
-    f"max_episode_steps = {DEFAULT_LIMIT} # the environment has no limit of its own: write the length of its longest episode, or "
-    "more (longer episodes are cut)"
+    f"max_episode_steps = {DEFAULT_LIMIT} # a guess: the environment has no limit of its own. Write the length of its longest episode, "
+    "or more (longer episodes are cut)"
 )
 
 CONTENTS = {  # what a person must write where a text is missing
@@ -63,25 +62,10 @@ class Draft:
     toml: str
     missing_keys: tuple[str, ...]
     """The keys that must be filled in."""
-    removed: tuple[str, ...]
-    """The sentences and table rows that were removed or shortened because they mention rewards."""
     teams: dict[str, str] = field(default_factory=dict)
     """The task files of the teams, by the file names that this one refers to."""
-    unused_sections: tuple[str, ...] = ()
-    """The titles of sections of the documentation that were not used."""
     logs_only: bool = False
     """Whether the task has logs but no environment."""
-
-    @property
-    def lists_entries(self) -> bool:
-        """Whether the text of the observation describes single entries. True if it is missing, or in the files of the teams."""
-        text = tomllib.loads(self.toml).get("observation", FILL_IN)
-        return FILL_IN in text or bool(entry_meanings(text))
-
-    @property
-    def guesses_limit(self) -> bool:
-        """Whether the environment names no time limit, so that the file has a guess."""
-        return LIMIT_LINE in self.toml
 
 
 def head_lines(
@@ -121,7 +105,6 @@ def make_draft(
     lines: Sequence[str],
     texts: Mapping[str, str],
     space_descriptions: Mapping[str, str],
-    removed: tuple[str, ...],
     **fields: Any,
 ) -> Draft:
     """Return the draft of a task file: its lines, and then its texts. Missing texts are marked.
@@ -135,7 +118,7 @@ def make_draft(
         if not text.startswith(description.removesuffix(".")):
             text = f"{description}\n{text}"
         lines.append(f"\n{key} = {_quote(text)}")
-    return Draft(name, "\n".join(lines) + "\n", missing_keys, removed, **fields)
+    return Draft(name, "\n".join(lines) + "\n", missing_keys, **fields)
 
 
 def _quote(text: str) -> str:

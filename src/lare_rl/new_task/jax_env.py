@@ -57,7 +57,7 @@ def draft_jax_task(environment_id: str) -> Draft:
     task_name, sizes = file_name(name), (env.spec.observation_size, env.spec.action_size)
     lines = [*draft.head_lines(task_name, environment_id, sizes, removed), draft.SCORE_LINE, *limit_lines]
     space_descriptions = {"observation": _describe_observation(env, family), "action": _describe_action(env.spec)}
-    return draft.make_draft(task_name, lines, texts, space_descriptions, removed)
+    return draft.make_draft(task_name, lines, texts, space_descriptions)
 
 
 def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:

@@ -80,16 +80,16 @@ def write_team_drafts(
     teams, sizes = env.spec.teams, (env.spec.observation_size, env.spec.action_size)
     task_lines = [*draft.head_lines(name, environment_id, sizes, removed), draft.SCORE_LINE, *more_lines]
     if len(teams) == 1:
-        return draft.make_draft(name, task_lines, texts, _describe_spaces(env, teams[0]), removed)
+        return draft.make_draft(name, task_lines, texts, _describe_spaces(env, teams[0]))
     files = {}
     for team in teams:
         team_name = file_name(team.name)
         lines = [*draft.head_lines(team_name, environment_id, sizes, removed), *_team_lines(env, team)]
-        team_draft = draft.make_draft(name, lines, _team_texts(env, team, texts), _describe_spaces(env, team), removed)
+        team_draft = draft.make_draft(name, lines, _team_texts(env, team, texts), _describe_spaces(env, team))
         files[f"{name}-{team_name}.toml"] = team_draft.toml
     task_lines += [*TEAMS_COMMENT, f"teams = {json.dumps(list(files))}"]
     task_texts = texts | dict.fromkeys(TEAM_KEYS, "See the teams.")
-    task_draft = draft.make_draft(name, task_lines, task_texts, {}, removed, teams=files)
+    task_draft = draft.make_draft(name, task_lines, task_texts, {}, teams=files)
     return replace(task_draft, missing_keys=tuple(key for key in texts if not texts[key]))
 
 

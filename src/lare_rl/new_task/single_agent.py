@@ -48,12 +48,12 @@ def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
     # An id without a version means the latest version, which may change later.
     _, name = split_environment(environment_id)
     full_id = environment_id.removesuffix(name) + env.spec.id if env.spec else environment_id
-    unused = unused_titles(sections)
+    sizes = observation_size, action_size
     lines = [
-        *draft.head_lines(file_name(name), full_id, (observation_size, action_size), removed, unused),
+        *draft.head_lines(file_name(name), full_id, sizes, removed, unused_titles(sections)),
         draft.SCORE_LINE,
         draft.MEASURES_LINE,
         draft.GROUP_LINE,
         *([] if env.spec and env.spec.max_episode_steps else [draft.LIMIT_LINE]),
     ]
-    return draft.make_draft(file_name(name), lines, texts, space_descriptions, removed, unused_sections=unused)
+    return draft.make_draft(file_name(name), lines, texts, space_descriptions)
