@@ -6,7 +6,6 @@ import math
 import signal
 import sys
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -20,7 +19,7 @@ from helpers.toy_logs import PHI, logged_episodes, read_directory
 from lare_rl import LareError
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.logs import log as log_module
-from lare_rl.logs.relabel import MESSAGES, Relabelled, _r2_within_groups, hold_out_flags, predicted_return_statistics
+from lare_rl.logs.relabel import MESSAGES, Relabelled, _r2_within_groups, hold_out_flags
 from lare_rl.tasks.spec import PaidSteps
 from lare_rl.util.findings import render
 
@@ -209,40 +208,29 @@ def test_hold_out_flags_are_even():
         assert all(abs(sum(flags[start : start + 100]) - 100 * share) <= 1 for start in range(0, 1000, 100))
 
 
-def test_predicted_return_statistics():
-    returns, predictions = [float(i) for i in range(8)], [14.0, 12.0, 10.0, 8.0, 6.0, 4.0, 2.0, 0.0]
-    r2, error, correlation = predicted_return_statistics(returns, predictions)
-    assert r2 == pytest.approx(1 - sum((y - y_hat) ** 2 for y, y_hat in zip(returns, predictions, strict=True)) / 42)
-    assert error > 0
-    assert correlation == pytest.approx(-1)
-    assert np.isnan(predicted_return_statistics(returns[:7], predictions[:7])).all()
-    for constant in ([1e4] * 8, [1e4 + 1e-4 * value for value in returns]):
-        assert math.isnan(predicted_return_statistics(returns, constant)[2])
-        assert math.isnan(predicted_return_statistics(constant, returns)[2])
+RETURNS, PREDICTIONS = [0.0, 1.0, 0.0, 1.0, 9.0, 8.0, 9.0, 8.0], [0.1, 1.0, 0.0, 1.0, 9.0, 8.0, 9.0, 8.0]
+EQUAL = [1e4 + 1e-4 * number for number in range(8)]  # but for rounding
 
 
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"held_out": 7}, ["too_few"]),
-        ({"return_correlation": math.nan, "return_r2": math.nan}, ["constant"]),
-        ({"return_correlation": math.nan, "return_r2": -0.01}, ["r2", "worthless"]),  # equal predictions
-        ({"return_r2": math.nan}, ["correlation"]),
-        ({"return_r2": 0.09}, ["r2", "worthless"]),
+        ({"returns": RETURNS[:7], "predictions": PREDICTIONS[:7]}, ["too_few"]),
+        ({"returns": EQUAL}, ["constant"]),
+        ({"predictions": EQUAL, "calibrated": False}, ["constant"]),
+        ({"predictions": EQUAL}, ["r2", "worthless"]),
+        ({"calibrated": False}, ["correlation"]),
         # The groups explain the returns, and the steps nothing.
-        ({"group_r2": 0.05}, ["r2", "within_groups", "worthless_within_groups"]),
+        (
+            {"groups": ["low"] * 4 + ["high"] * 4, "predictions": [0.0] * 4 + [9.0] * 4},
+            ["r2", "within_groups", "worthless_within_groups"],
+        ),
         ({"cut": 3}, ["cut", "r2"]),
     ],
 )
 def test_findings(changes, expected):
-    values = {"episodes": 1, "steps": 1000, "cut": 0, "held_out": 8, "return_r2": 0.9954, "return_r2_error": 0.0004}
-    values |= {
-        "out": "new",
-        "method": "rd",
-        "return_correlation": 0.99,
-        "explanation": ("Because.",),
-        "group_r2": math.nan,
-    }
+    values = {"out": "new", "method": "rd", "calibrated": True, "episodes": 1, "steps": 1000, "cut": 0}
+    values |= {"returns": RETURNS, "predictions": PREDICTIONS, "groups": [], "explanation": ("Because.",)}
     result = Relabelled(**(values | changes))
     assert codes(result) == ["relabelled", *expected]
     assert result.summary == [*(render(finding, MESSAGES) for finding in result.findings), "Because."]
@@ -292,14 +280,6 @@ def test_bad_arguments(tmp_path, log, options, message):
     with pytest.raises(LareError, match=message):
         relabel(list(logged_episodes(10)) if log is None else log, tmp_path / "new", **options)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no directory in which nobody can write")
-def test_output_is_checked_before_the_fit():
-    stages, log = [], list(logged_episodes(10))
-    with pytest.raises(LareError, match="/proc/new cannot be written"):
-        relabel(log, "/proc/new", method="rd-linear", listener=lambda *stage: stages.append(stage))
-    assert stages == []
 
 
 def test_command(command, folder, tmp_path, task):

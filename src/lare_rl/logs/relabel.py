@@ -6,10 +6,10 @@ and writes them.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import CONSTANT, FLOAT32_NOISE, correlation, r_squared
 
-__all__ = ["MESSAGES", "Relabelled", "hold_out_flags", "predicted_return_statistics", "relabel"]
+__all__ = ["MESSAGES", "Relabelled", "hold_out_flags", "relabel"]
 
 BLOCK_EPISODES = 10
 """Held-out episodes are drawn from each block of this many complete episodes, so that they are spread evenly over a sorted log."""
@@ -66,23 +66,54 @@ class Relabelled:
 
     out: str | Path
     method: str
+    calibrated: bool
+    """Whether r_hat is in the unit of returns."""
     episodes: int
     steps: int
     cut: int
     """Episodes that were cut before their end. They get rewards, but nothing is learned from them."""
-    held_out: int
-    """Complete episodes that were held out of the fit."""
-    return_r2: float
-    """R^2 of their returns. NaN for fewer than `MIN_R2_EPISODES`, for equal returns, or if r_hat is not in the unit of returns."""
-    return_r2_error: float
-    """The standard error of `return_r2` over these episodes."""
-    group_r2: float
-    """R^2 of the differences of these returns from the means of their groups. NaN without groups, and with too few returns."""
-    return_correlation: float
-    """Pearson's correlation of these returns with their predictions. NaN for fewer than `MIN_R2_EPISODES`, or if the returns or the
-    predictions are all equal."""
+    returns: Sequence[float]
+    """The returns of the complete episodes that were held out of the fit."""
+    predictions: Sequence[float]
+    """The predictions of these returns."""
+    groups: Sequence[Any]
+    """The groups of these episodes; empty without groups."""
     explanation: tuple[str, ...]
     """What the returns say about the factors: `CreditAssigner.explanation`."""
+
+    @property
+    def held_out(self) -> int:
+        """The number of complete episodes that were held out of the fit."""
+        return len(self.returns)
+
+    @property
+    def return_r2(self) -> float:
+        """R^2 of their returns. NaN for fewer than `MIN_R2_EPISODES`, for equal returns, or if r_hat is not in the unit of returns."""
+        return self._r2_and_error()[0]
+
+    @property
+    def return_r2_error(self) -> float:
+        """The standard error of `return_r2` over these episodes."""
+        return self._r2_and_error()[1]
+
+    @property
+    def group_r2(self) -> float:
+        """R^2 of the differences of these returns from the means of their groups. NaN without groups and, as for
+        `return_r2`, for too few or equal returns, or if r_hat is not in the unit of returns.
+        """
+        return _r2_within_groups(self.returns, self.predictions, self.groups) if self.calibrated else math.nan
+
+    @property
+    def return_correlation(self) -> float:
+        """Pearson's correlation of these returns with their predictions.
+
+        NaN for fewer than `MIN_R2_EPISODES`, or if the returns or the predictions are all equal.
+        """
+        y, predicted = np.array(self.returns), np.array(self.predictions)
+        if self.held_out < MIN_R2_EPISODES:
+            return math.nan
+        varies = all(np.ptp(values) > FLOAT32_NOISE * np.abs(values).max() for values in (y, predicted))
+        return correlation(y, predicted) if varies else math.nan
 
     @property
     def findings(self) -> list[Finding]:
@@ -95,6 +126,11 @@ class Relabelled:
     def summary(self) -> list[str]:
         """The result and the explanation as sentences."""
         return [*(render(finding, MESSAGES) for finding in self.findings), *self.explanation]
+
+    def _r2_and_error(self) -> tuple[float, float]:
+        if not self.calibrated or self.held_out < MIN_R2_EPISODES:
+            return math.nan, math.nan
+        return r_squared(np.array(self.returns), np.array(self.predictions))
 
     def _prediction_findings(self) -> Iterator[Finding]:
         episodes = {"episodes": self.held_out}
@@ -112,16 +148,6 @@ class Relabelled:
             yield Finding("constant", episodes)
         else:
             yield Finding("correlation", {**episodes, "correlation": self.return_correlation})
-
-
-def predicted_return_statistics(returns: Sequence[float], predictions: Sequence[float]) -> tuple[float, float, float]:
-    """Return R^2 of predicted returns, its standard error, and the correlation. NaN for fewer than `MIN_R2_EPISODES`."""
-    if len(returns) < MIN_R2_EPISODES:
-        return math.nan, math.nan, math.nan
-    y, predicted = np.array(returns), np.array(predictions)
-    r2, error = r_squared(y, predicted)
-    varies = all(np.ptp(values) > FLOAT32_NOISE * np.abs(values).max() for values in (y, predicted))
-    return r2, error, correlation(y, predicted) if varies else math.nan
 
 
 def _r2_within_groups(returns: Sequence[float], predictions: Sequence[float], groups: Sequence[Any]) -> float:
@@ -212,27 +238,21 @@ def relabel(
     )
     bytes_per_step = make_assigner(capacity=1).store.bytes_per_step
     credit = make_assigner(capacity=max(MIN_CAPACITY, int(memory * 2**30 / bytes_per_step)))
-    size = _fit(credit, log, hold_out_flags(hold_out, seed), updates, listener)
-    explanation, seen = tuple(credit.explanation()), _SecondPass()
-    episodes = _compute_rewards(credit, log, hold_out_flags(hold_out, seed), size, seen, listener)
+    n_episodes, n_steps, n_cut = _fit(credit, log, hold_out_flags(hold_out, seed), updates, listener)
+    explanation, held_out = tuple(credit.explanation()), _HeldOut([], [], [])
+    size = n_episodes, n_steps
+    episodes = _compute_rewards(credit, log, hold_out_flags(hold_out, seed), size, held_out, listener)
     name = credit.config.method.name
     comment = f"Rewards by lare-rl relabel, {name}; the old rewards are in infos['paid'], after an entry for the reset."
     path = log.write(out, episodes, overwrite, comment)
-    r2, r2_error, return_correlation = predicted_return_statistics(seen.returns, seen.predictions)
-    group_r2 = _r2_within_groups(seen.returns, seen.predictions, seen.groups)
-    if not credit.config.method.calibrated:
-        r2 = r2_error = group_r2 = math.nan
     return Relabelled(
         out=path,
         method=name,
-        episodes=seen.episodes,
-        steps=seen.steps,
-        cut=seen.cut,
-        held_out=len(seen.returns),
-        return_r2=r2,
-        return_r2_error=r2_error,
-        group_r2=group_r2,
-        return_correlation=return_correlation,
+        calibrated=credit.config.method.calibrated,
+        episodes=n_episodes,
+        steps=n_steps,
+        cut=n_cut,
+        **held_out._asdict(),
         explanation=explanation,
     )
 
@@ -250,26 +270,19 @@ def hold_out_flags(share: float, seed: int) -> Iterator[bool]:
         block += 1
 
 
-@dataclass
-class _SecondPass:
-    """What the second pass has seen so far."""
+class _HeldOut(NamedTuple):
+    """Episodes that were held out of the fit, as in `Relabelled`."""
 
-    episodes: int = 0
-    steps: int = 0
-    cut: int = 0
-    returns: list[float] = field(default_factory=list)
-    """True returns of the held-out episodes."""
-    predictions: list[float] = field(default_factory=list)
-    """Their predicted returns."""
-    groups: list[Any] = field(default_factory=list)
-    """Their groups; empty without groups."""
+    returns: list[float]
+    predictions: list[float]
+    groups: list[Any]
 
 
 def _fit(
     credit: CreditAssigner, log: Log, is_held_out: Iterator[bool], updates: int, listener: Listener
-) -> tuple[int, int]:
-    """Fit to the complete episodes that are not held out. Return the numbers of episodes and steps in the log."""
-    n_episodes, n_steps, n_fitted = 0, 0, 0
+) -> tuple[int, int, int]:
+    """Fit to the complete episodes that are not held out. Return the numbers of episodes, of steps, and of cut episodes."""
+    n_episodes, n_steps, n_cut, n_fitted = 0, 0, 0, 0
     for episode in log.episodes():
         if episode.complete and (episode.group is not None) != log.layout.has_groups:
             problem = "no group" if log.layout.has_groups else "a group"
@@ -285,14 +298,14 @@ def _fit(
                 credit.fit_pending()
             except LareError as error:
                 raise LareError(f"{episode.name}: {error}") from error
-        n_episodes, n_steps = n_episodes + 1, n_steps + len(episode)
+        n_episodes, n_steps, n_cut = n_episodes + 1, n_steps + len(episode), n_cut + (not episode.complete)
         listener("fit", n_episodes, log.n_episodes)
     if not n_fitted and credit.config.method.fit is not None:
         raise LareError(
             f"{log.name}: none of {n_episodes} episodes is complete and not held out, so there is no return to fit"
         )
     credit.fit(updates)
-    return n_episodes, n_steps
+    return n_episodes, n_steps, n_cut
 
 
 def _compute_rewards(
@@ -300,14 +313,14 @@ def _compute_rewards(
     log: Log,
     is_held_out: Iterator[bool],
     size: tuple[int, int],
-    seen: _SecondPass,
+    held_out: _HeldOut,
     listener: Listener,
 ) -> Iterator[RelabelledEpisode]:
-    """Yield every episode with its rewards, and add it to `seen`.
+    """Yield every episode with its rewards, and add the held-out ones to `held_out`.
 
     Raises `LareError` if the log has another `size` than in the first pass.
     """
-    is_average = credit.score_type == "average"
+    is_average, n_episodes, n_steps = credit.score_type == "average", 0, 0
     # `phi` takes about as long for many steps as for few.
     for batch in batch_by_steps(log.episodes(), len):
         batch_payments = [find_payments(episode, credit.config.payments) for episode in batch]
@@ -320,22 +333,19 @@ def _compute_rewards(
         )
         r_hats = np.split(r_hats, np.cumsum([len(episode) for episode in batch])[:-1])
         for episode, r_hat, payments in zip(batch, r_hats, batch_payments, strict=True):
-            seen.episodes += 1
-            seen.steps += len(episode)
-            seen.cut += not episode.complete
+            n_episodes, n_steps = n_episodes + 1, n_steps + len(episode)
             predicted = predict_payments(r_hat, payments, is_average=is_average)
             if episode.complete and next(is_held_out):
-                seen.returns.append(float(episode.reward.sum()))
+                held_out.returns.append(float(episode.reward.sum()))
                 level = None if episode.group is None else credit.group_names.get(episode.group)
-                seen.predictions.append(credit.step_rewards.predicted_return(predicted, level, payments.length))
+                held_out.predictions.append(credit.step_rewards.predicted_return(predicted, level, payments.length))
                 if episode.group is not None:
-                    seen.groups.append(episode.group)
+                    held_out.groups.append(episode.group)
             if episode.complete and credit.config.spec.is_exact:
                 residual = np.add.reduceat(episode.reward, payments.end - payments.n_since_last) - predicted
                 r_hat = make_exact(r_hat, residual, payments, credit.config.settings)
             yield RelabelledEpisode(episode, r_hat)
-            listener("write", seen.episodes, size[0])
-    new_size = seen.episodes, seen.steps
-    if new_size != size:
-        before, after = (f"{n_episodes} episodes of {n_steps} steps" for n_episodes, n_steps in (size, new_size))
+            listener("write", n_episodes, size[0])
+    if (n_episodes, n_steps) != size:
+        before, after = (f"{episodes} episodes of {steps} steps" for episodes, steps in (size, (n_episodes, n_steps)))
         raise LareError(f"{log.name} changed while it was read: it had {before}, and now {after}")
