@@ -1,13 +1,10 @@
 """The loop of candidates, combination and correction."""
 
-import re
-
 import pytest
 
-from helpers.long_tests import long_case
 from helpers.scripted_model import ScriptedModel, to_reply
 from helpers.toy_envs import PHI, phi_source, toy_spec
-from lare_rl.envs.load import read_task, shipped_tasks
+from lare_rl.envs.load import read_task
 from lare_rl.errors import LareError
 from lare_rl.latent.design import DesignError, design
 from lare_rl.latent.verify import Check, verify
@@ -34,28 +31,6 @@ def scripted(*replies, **options):
     return ScriptedModel(replies=replies, **options)
 
 
-QUICK_TASKS = ("CompetitivePP-6", "HalfCheetah-v4", "Reacher-v4", "TriangleArea")
-TASKS = [name for name in shipped_tasks() if read_task(name).family != "smac"]  # which has to be installed by hand
-
-
-@pytest.mark.parametrize("name", [name if name in QUICK_TASKS else long_case(name) for name in TASKS])
-def test_shipped_task(name):
-    spec = read_task(name)
-    if module := {"playground": "mujoco_playground", "jumanji": "jumanji"}.get(spec.family):
-        pytest.importorskip(module)
-    if spec.teams:
-        with pytest.raises(LareError, match="has teams"):
-            design(spec)
-        return
-    function = design(spec)
-    assert function.task == name
-    assert re.fullmatch(r"Claude \(Anthropic\), recorded 2026-11-(2\d|30), draw 0", function.model)
-    corrections = ["correct"] * 4 if name == "Snake-v1" else []
-    assert [exchange["stage"] for exchange in function.exchanges] == ["candidate", "combine", *corrections]
-    assert function.size == len(set(function.names)) > 1
-    assert all(check.passed for check in function.checks)
-
-
 def test_draws_and_kinds():
     task = read_task("Reacher-v4")
     functions = [design(task, draw=draw) for draw in (0, 1)]
@@ -68,6 +43,8 @@ def test_draws_and_kinds():
     for candidates, words in ((3, "1 or 5 candidates"), (0, "= 0"), (101, "= 101")):
         with pytest.raises(LareError, match=words):
             design(task, candidates=candidates)
+    with pytest.raises(LareError, match="has teams"):
+        design("CompetitivePP-6")
     model = scripted(GOOD)
     with pytest.raises(LareError, match="nothing/Here-v0"):  # the environment is checked first
         design(toy_spec(environment="nothing/Here-v0"), model=model, candidates=1)
@@ -182,15 +159,17 @@ def test_without_pre_verification(chase):
             design(chase, model=scripted(text), candidates=1, pre_verification=False)
 
 
-@pytest.mark.parametrize(("error", "status"), [(LareError("no model"), 2), (KeyboardInterrupt(), 130)])
+@pytest.mark.parametrize(
+    ("error", "status"), [(LareError("no model"), 2), (RuntimeError("server down"), 2), (KeyboardInterrupt(), 130)]
+)
 def test_replies_survive_an_error(chase, error, status):
     with pytest.raises(DesignError) as raised:
         design(chase, model=scripted(GOOD, failing_reply("a"), error=error), candidates=3)
     assert [exchange.replies for exchange in raised.value.recorder.exchanges] == [[GOOD, failing_reply("a")]]
     assert raised.value.status == status
-    with pytest.raises(type(error)) as raised:
+    with pytest.raises(LareError if status == 2 else KeyboardInterrupt) as raised:
         design(chase, model=scripted(error=error), candidates=3)
-    assert raised.value is error
+    assert not isinstance(raised.value, DesignError)
 
 
 def test_reply_that_is_no_text(chase):

@@ -17,23 +17,13 @@ RECORDINGS = sorted(f"{kind.name}/{entry.name}" for kind in KINDS for entry in k
 SHORT = ("reward/HalfCheetah-v4.draw0.json", "reward/Reacher-v4.draw0.json", "factors/Reacher-v4.draw2.json")
 
 
-@pytest.mark.parametrize(
-    ("source", "errors"),
-    [
-        (phi_source("raise ValueError(np.load('x'))"), ["E-NUMPY line 2: np.load"]),
-        ("import os\n" + phi_source("return [np.two(3)]"), ["E-IMPORT line 1: import os", "E-NUMPY line 3: np.two"]),
-        (phi_source("return [action[:, 0]]"), ["E-FORM line 2: factor 1 must be an array of the shape (batch, 1)"]),
-        ("x = 1", ["E-FORM line 1: there is no function evaluation_func"]),
-    ],
-)
-def test_verify_unreadable(chase, source, errors):
-    verdict = verify(source, chase)
+def test_verify_unreadable(chase):
+    verdict = verify("import os\n" + phi_source("return [np.two(3)]"), chase)
     assert not verdict.passed
     assert [check.name for check in verdict.checks] == ["read"]
-    messages = verdict.errors.splitlines()
-    assert len(messages) == len(errors)
-    for message, start in zip(messages, errors, strict=True):
-        assert message.startswith(start)
+    first, second = verdict.errors.splitlines()
+    assert first.startswith("E-IMPORT line 1: import os")
+    assert second.startswith("E-NUMPY line 3: np.two")
     assert (verdict.graph, verdict.advice) == (None, ())
 
 
@@ -142,9 +132,6 @@ def test_sample_steps_evenly_spaced(chase):
 @pytest.mark.parametrize(
     ("steps", "words"),
     [
-        ((np.zeros((5, 3)), np.zeros((5, 1))), r"observations .*\(n, 2\)"),
-        ((np.zeros((5, 2)), np.zeros((4, 1))), r"actions .*\(n, 1\)"),
-        ((np.zeros((0, 2)), np.zeros((0, 1))), r"observations .*\(n, 2\)"),
         ((np.full((5, 2), np.nan), np.zeros((5, 1))), "observations .*not finite"),
         ((np.full((5, 2), 1e39), np.zeros((5, 1))), "observations .*not finite"),  # in float32
         ((np.zeros((5, 2)), np.full((5, 1), np.inf)), "actions .*not finite"),

@@ -23,7 +23,7 @@ from lare_rl.phi.names import factor_meanings, factor_names
 from lare_rl.phi.read import read
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec, names_by_side, require_role, select_sides
 from lare_rl.util.files import write_bytes
-from lare_rl.util.rows import as_numbers, as_rows
+from lare_rl.util.rows import as_numbers
 
 __all__ = [
     "CHANGED_SUFFIX", "HEADER_PREFIX", "LatentFunction", "check_task", "features_text", "function_from_verdict",
@@ -42,7 +42,7 @@ _Item = TypeVar("_Item")
 
 @dataclass(frozen=True)
 class LatentFunction:
-    """`phi` of one task: (batch, observation), (batch, action) -> (batch, d).
+    """`phi` of one task: (*batch, observation), (*batch, action) -> (*batch, d).
 
     A function from `design`, `verify_function` or `load_function` has passed every check.
     """
@@ -93,22 +93,27 @@ class LatentFunction:
         return [features_text(indices) for indices in self.graph.entries_read("factors")]
 
     def __call__(self, observation: Any, action: Any) -> Float[np.ndarray, "*batch factors"]:
-        """Compute the factors of a batch of steps, or of a single step.
+        """Compute the factors of steps.
 
         Args:
-            observation: (batch, observation size), or a single row (observation size,).
-            action: (batch, action size), or (action size,).
+            observation: (*batch, observation size), with any batch axes, or none.
+            action: (*batch, action size), with the same batch axes.
 
         Raises:
-            LareError: the arrays do not have the task's sizes, or the numbers of observations and actions differ.
+            LareError: the arrays do not have the task's sizes, or their batch axes differ.
             NonFiniteFactorError: a factor is not finite.
         """
-        observations = as_rows("observation", observation, self.sizes[0])
-        actions = as_rows("action", action, self.sizes[1])
-        single = observations.ndim == actions.ndim == 1
-        observations, actions = np.atleast_2d(observations), np.atleast_2d(actions)
-        if len(observations) != len(actions):
-            raise LareError(f"the numbers of observations and actions differ: {len(observations)} and {len(actions)}")
+        arrays = []
+        for name, values, size in zip(("observation", "action"), (observation, action), self.sizes, strict=True):
+            array = as_numbers(name, values)
+            if not array.ndim or array.shape[-1] != size:
+                raise LareError(f"{name}s must have the shape (*batch, {size}): the shape is {array.shape}")
+            arrays.append(array)
+        batch_shape = arrays[0].shape[:-1]
+        if arrays[1].shape[:-1] != batch_shape:
+            shapes = " and ".join(str(array.shape) for array in arrays)
+            raise LareError(f"observations and actions need the same batch axes: their shapes are {shapes}")
+        observations, actions = (array.reshape(math.prod(batch_shape), array.shape[-1]) for array in arrays)
         factors = compute_batch(self.graph, observations, actions)
         if not np.isfinite(factors).all():
             row, column = np.argwhere(~np.isfinite(factors))[0]
@@ -116,29 +121,22 @@ class LatentFunction:
             text = np.array2string(observations[row], precision=3, threshold=6)
             message = f"the latent function failed: {factor} for the observation {text}"
             raise NonFiniteFactorError(message, observations, actions)
-        return factors[0] if single else factors
+        return factors.reshape(*batch_shape, self.size)
 
     def step_factors(
         self, observation: Any, action: Any, next_observation: Any, scored_observation: ScoredObservation
     ) -> Float[np.ndarray, "*batch factors"]:
-        """Compute the factors of steps from the observations that `scored_observation` names. Arrays may have any batch axes.
+        """Compute the factors of steps from the observations that `scored_observation` names.
 
         For "both", the factors of both observations are concatenated.
 
         Raises:
-            LareError: as for `__call__`, the batch axes differ, or `scored_observation` is not before, after or both.
+            LareError: as for `__call__`, or `scored_observation` is not before, after or both.
         """
         if scored_observation not in ("before", "after", "both"):
             raise LareError(f"scored_observation = {short_repr(scored_observation)}: it is before, after or both")
         states = select_sides(scored_observation, observation, next_observation)
-        arrays = [as_numbers("observation", state) for state in states] + [as_numbers("action", action)]
-        batch_shape = arrays[-1].shape[:-1]
-        if any(not array.ndim or array.shape[:-1] != batch_shape for array in arrays):
-            shapes = " and ".join(str(array.shape) for array in arrays)
-            raise LareError(f"observations and actions need the same batch axes: their shapes are {shapes}")
-        *observations, actions = (array.reshape(math.prod(batch_shape), array.shape[-1]) for array in arrays)
-        factors = [self(array, actions) for array in observations]
-        return np.concatenate(factors, axis=-1).reshape(*batch_shape, self.n_factors(scored_observation))
+        return np.concatenate([self(state, action) for state in states], axis=-1)
 
     def n_factors(self, scored_observation: ScoredObservation) -> int:
         """Return the number of factors of `step_factors`."""
