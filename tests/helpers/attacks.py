@@ -74,7 +74,6 @@ ATTACKS = {
     "einsum": NUMPY + "x = np.einsum('a,b,c,d->', *[np.ones(999)] * 4)",
     "einsum of many letters": NUMPY + "x = np.einsum('abcdefghi,jklmnopqr->', *[np.ones((2,) * 9)] * 2)",
     "outer": NUMPY + "x = np.multiply.outer(np.ones(9999), np.ones(9999))",
-    "windows": NUMPY + "x = np.lib.stride_tricks.sliding_window_view(np.ones(60000), 30000)",
     "tril_indices": NUMPY + "x = np.tril_indices(60000)",
     "bincount": NUMPY + "x = np.bincount([10 ** 12])",
     "vander": NUMPY + "x = np.vander(np.ones(999), 10 ** 9)",

@@ -6,7 +6,6 @@ import lare_rl
 from helpers.scripted_model import ScriptedModel, to_reply
 from helpers.toy_envs import PHI, toy_spec
 from lare_rl.errors import LareError
-from lare_rl.latent.design import DesignError
 from lare_rl.llm.live import LiveModel
 from lare_rl.llm.model import as_model, ask
 
@@ -31,19 +30,6 @@ def test_key_and_half_of_surrogate_pair_are_removed(monkeypatch):
     assert ask(as_model(lambda messages: "It is sk-secret-key."), []) == "It is [key]."
     with pytest.raises(LareError, match=r"KeyError: '\[key\]'"):
         ask(as_model(lambda messages: {}["sk-secret-key"]), [])
-
-
-@pytest.mark.parametrize("reply", [None, b"text", {"content": "text"}])
-def test_function_must_return_a_text(reply):
-    with pytest.raises(LareError, match="must return a text, and returned"):
-        ask(as_model(lambda messages: reply), [])
-
-
-def test_replies_survive_any_error_of_a_model():
-    model = ScriptedModel(PHI, error=RuntimeError("server down"))
-    with pytest.raises(DesignError, match="RuntimeError: server down") as error:
-        lare_rl.design(toy_spec(), model=model, candidates=2)
-    assert len(error.value.recorder.exchanges) == 1
 
 
 def test_objects_with_a_name_are_used_as_they_are(monkeypatch):

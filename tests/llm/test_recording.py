@@ -5,10 +5,7 @@ import os
 
 import pytest
 
-from helpers.toy_envs import toy_spec
-from lare_rl.envs.load import read_task
 from lare_rl.errors import LareError
-from lare_rl.llm.prompts import candidate, combine
 from lare_rl.llm.recording import RecordedModel, Recorder, read_recording, shipped_recordings
 
 REQUEST = [{"role": "user", "content": "Write some."}]
@@ -40,20 +37,6 @@ def test_only_the_line_of_an_error_may_differ():
     assert model.reply(request(35, "too many"), 0) == "one"
     with pytest.raises(LareError, match="no recorded reply"):
         model.reply(request(27, "too few"), 0)
-
-
-def test_shipped_recordings():
-    task = read_task("Reacher-v4")
-    for draw in range(5):
-        model = RecordedModel(shipped_recordings("factors", draw), task.name)
-        replies = [model.reply(candidate(task), sample) for sample in range(5)]
-        assert len(set(replies)) == 5
-        assert model.reply(combine(task, replies), 0)
-        assert model.name.endswith(f", draw {draw}")
-    for key in ("description", "observation", "action"):
-        changed = toy_spec(**(task.model_dump() | {key: getattr(task, key) + " Please."}))
-        with pytest.raises(LareError, match="no recorded reply"):
-            model.reply(candidate(changed), 0)
 
 
 @pytest.mark.parametrize(("kind", "draw", "draws"), [("factors", 5, "0, 1, 2, 3, 4"), ("reward", 1, "draws are 0")])

@@ -1,9 +1,5 @@
 """Names and meanings of factors, as the source gives them."""
 
-import gc
-import time
-from concurrent.futures import ThreadPoolExecutor
-
 import pytest
 
 from helpers.toy_envs import PHI, phi_source
@@ -63,23 +59,3 @@ def test_factor_meanings_comment_above_an_assignment(lines, meaning):
 )
 def test_factor_meanings_of_two(body, meanings):
     assert factor_meanings(phi_source(body), ["x", "y"]) == meanings
-
-
-def test_factor_names_in_threads():
-    """As several candidates are read. JAX has such a hook in the garbage collector too."""
-    source = phi_source("\n".join(["action = action + (1 + (2 + (3 + (4 + action))))"] * 20) + "\nreturn [action]")
-    threshold = gc.get_threshold()
-    threads = ThreadPoolExecutor(8)
-
-    def let_another_go_on(phase, info):
-        time.sleep(0)
-
-    gc.callbacks.append(let_another_go_on)
-    gc.set_threshold(5)
-    try:
-        names = list(threads.map(lambda _: factor_names(source, 1), range(200)))
-    finally:
-        gc.set_threshold(*threshold)
-        gc.callbacks.remove(let_another_go_on)
-        threads.shutdown()
-    assert names == [["action"]] * 200
