@@ -123,7 +123,7 @@ def test_attempts_end(chase):
     assert model.replies == [GOOD]
     assert [message["content"] for message in model.requests[-1] if message["role"] == "assistant"] == bad[:-1]
     assert [exchange.replies for exchange in error.value.recorder.exchanges] == [[text] for text in bad]
-    assert error.value.model == "scripted"
+    assert error.value.recorder.model is model
 
 
 def test_record(chase, tmp_path):

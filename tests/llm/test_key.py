@@ -4,10 +4,12 @@ import json
 
 import pytest
 
+from helpers.scripted_model import ScriptedModel
 from helpers.toy_envs import PHI
 from lare_rl.latent.function import LatentFunction
 from lare_rl.llm.key import redact_key
-from lare_rl.llm.recording import Recorder
+from lare_rl.llm.recorder import Recorder
+from lare_rl.llm.recording import Exchange
 from lare_rl.llm.reply import parse_reply
 
 KEY = "sk-a+key/that.nobody"
@@ -55,10 +57,10 @@ def test_redact_key_keeps_a_short_key(monkeypatch):
 def test_files_of_a_design(tmp_path, spelling):
     source = json.dumps(PHI).replace("effort", "effort KEY")
     text = f'{{"Understand": "KEY", "Analyze": "KEY", "Functions": {source}}}'.replace("KEY", SPELLINGS[spelling])
-    recorder = Recorder("Chase", "factors", path=tmp_path / "record.json")
-    recorder.add("candidate", [{"role": "user", "content": "Write."}], text, "m")
-    exchanges = tuple(exchange.model_dump() for exchange in recorder.exchanges)
-    function = LatentFunction("Chase", "factors", parse_reply(text).functions, 2, (), (2, 1), "m", exchanges)
+    exchange = {"stage": "candidate", "messages": [{"role": "user", "content": "Write."}], "replies": [text]}
+    recorder = Recorder(ScriptedModel(), "Chase", "factors", exchanges=[Exchange(**exchange)])
+    recorder.save(tmp_path / "record.json")
+    function = LatentFunction("Chase", "factors", parse_reply(text).functions, 2, (), (2, 1), "m", (exchange,))
     function.save(tmp_path / "phi.py")
     assert "effort [key]" in (tmp_path / "phi.py").read_text()
     for name in ("phi.py", "phi.json", "record.json"):

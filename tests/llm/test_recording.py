@@ -5,8 +5,10 @@ import os
 
 import pytest
 
+from helpers.scripted_model import ScriptedModel
 from lare_rl.errors import LareError
-from lare_rl.llm.recording import RecordedModel, Recorder, read_recording, shipped_recordings
+from lare_rl.llm.recorder import Recorder
+from lare_rl.llm.recording import RecordedModel, read_recording, shipped_recordings
 
 REQUEST = [{"role": "user", "content": "Write some."}]
 EXCHANGE = {"stage": "candidate", "messages": REQUEST, "replies": ["one", "two"]}
@@ -66,37 +68,39 @@ def test_invalid_recording(text, words):
 
 def test_only_the_recording_of_the_same_exchanges_is_continued(tmp_path):
     path = tmp_path / "talk.json"
-    Recorder("Chase", "factors", path=path).add("candidate", REQUEST, "one", "A model")
+    model = ScriptedModel(replies=["one", "two"])
+    Recorder(model, "Chase", "factors", path).ask("candidate", REQUEST)
     first = path.read_text()
     exchanges = read_recording(first, "talk.json").exchanges
-    Recorder("Chase", "factors", path=path, exchanges=[*exchanges]).add("candidate", REQUEST, "two", "A model")
+    Recorder(model, "Chase", "factors", path, [*exchanges]).ask("candidate", REQUEST)
+    assert model.numbers == [0, 1]
     content = path.read_text()
     assert read_recording(content, "talk.json").exchanges[0].replies == ["one", "two"]
     for text in (content, first.replace("Chase", "Walk"), first.replace("factors", "reward"), "{}", "my notes"):
         path.write_text(text)
         with pytest.raises(LareError, match="exists"):
-            Recorder("Chase", "factors", path=path, exchanges=exchanges)
+            Recorder(model, "Chase", "factors", path, exchanges)
 
 
 def test_failed_write_loses_no_reply(tmp_path, monkeypatch):
     path = tmp_path / "talk.json"
-    recorder = Recorder("Chase", "factors", path=path)
+    recorder = Recorder(ScriptedModel(replies=["one", "two", "three"]), "Chase", "factors", path)
 
-    def fail_to_add(reply):
+    def fail_to_ask():
         def fail(*_):
             raise OSError(28, "No space left on device")
 
         with monkeypatch.context() as patch:
             patch.setattr(os, "replace", fail)
             with pytest.raises(LareError, match="No space left"):
-                recorder.add("candidate", REQUEST, reply, "A model")
+                recorder.ask("candidate", REQUEST)
 
-    fail_to_add("one")
+    fail_to_ask()
     assert list(tmp_path.iterdir()) == []
-    recorder.add("candidate", REQUEST, "two", "A model")
+    recorder.ask("candidate", REQUEST)
     content = path.read_text()
-    fail_to_add("three")
+    fail_to_ask()
     assert path.read_text() == content
     assert list(tmp_path.iterdir()) == [path]
-    recorder.save(path, "A model", new=False)
+    recorder.save(path, new=False)
     assert read_recording(path.read_text(), "talk.json").exchanges[0].replies == ["one", "two", "three"]

@@ -160,17 +160,17 @@ def check_function_files(out: Path | None, record: Path | None = None) -> Path |
 
 def _save_attempts(error: "DesignError", new_path: Path) -> None:
     """Save the replies, which were paid for, in the recorder's file or else in a new one. If both fail, print them."""
-    recorder, model = error.recorder, error.model
+    recorder = error.recorder
     recorded = [recorder.path] if recorder.path and recorder.owns_file else []
     for path in (*recorded, new_path):
         try:
-            recorder.save(path, model, new=path == new_path)
+            recorder.save(path, new=path == new_path)
         except LareError as write_error:
             print_error(write_error)
         else:
             print_progress(f"every attempt is kept in {path}")
             return
-    print_line(recorder.to_json(model))
+    print_line(recorder.to_json())
 
 
 def _save_function(function: "LatentFunction", out: Path, next_command: str) -> None:

@@ -1,7 +1,7 @@
 """Candidates, combine, verify, correct: lines 2 and 3 of Algorithm 1 of the LaRe paper."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -11,14 +11,14 @@ from lare_rl.errors import LareError, check_count
 from lare_rl.latent.function import LatentFunction, function_from_verdict, normalise_source
 from lare_rl.latent.verify import Check, Steps, Verdict, sample_steps, verify
 from lare_rl.llm import prompts
-from lare_rl.llm.model import Model, ModelFunction, as_model, ask, recorded_model
-from lare_rl.llm.prompts import MAX_ATTEMPTS, MAX_CANDIDATES, N_CANDIDATES, FunctionKind, Message, Stage, check_kind
-from lare_rl.llm.recording import Recorder
+from lare_rl.llm.model import Model, ModelFunction, as_model, recorded_model
+from lare_rl.llm.prompts import MAX_ATTEMPTS, MAX_CANDIDATES, N_CANDIDATES, FunctionKind, Message, check_kind
+from lare_rl.llm.recorder import Recorder
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec, require_role
 
 __all__ = [
-    "Conversation", "DesignError", "ask_and_record", "check_recorded", "correct_until_passing", "design", "examine_reply",
+    "Conversation", "DesignError", "check_recorded", "correct_until_passing", "design", "examine_reply",
     "keep_replies",
 ]  # fmt: skip
 
@@ -29,18 +29,17 @@ class DesignError(LareError):
     """No attempt passed, or an error or Ctrl-C came after the first reply.
 
     Attributes:
-        recorder: holds all exchanges with the model.
-        model: the name of the model.
+        recorder: holds the model, and all exchanges with it.
         status: the exit status of the command line: 1 if no attempt passed, 130 after Ctrl-C, and 2 for another error.
     """
 
-    def __init__(self, message: str, recorder: Recorder, model: str, status: int = 1):
+    def __init__(self, message: str, recorder: Recorder, status: int = 1):
         super().__init__(message)
-        self.recorder, self.model, self.status = recorder, model, status
+        self.recorder, self.status = recorder, status
 
 
 @contextlib.contextmanager
-def keep_replies(recorder: Recorder, model: Model) -> Iterator[None]:
+def keep_replies(recorder: Recorder) -> Iterator[None]:
     """If an error or Ctrl-C comes after the first reply, raise a `DesignError` that has the replies."""
     try:
         yield
@@ -48,18 +47,10 @@ def keep_replies(recorder: Recorder, model: Model) -> Iterator[None]:
         if isinstance(error, DesignError) or not recorder.exchanges:
             raise
         status = 2 if isinstance(error, LareError) else 130
-        raise DesignError(str(error) or "stopped", recorder, model.name, status) from error
-
-
-def ask_and_record(model: Model, recorder: Recorder, stage: Stage, messages: Sequence[Message]) -> str:
-    """Return a new reply to a request."""
-    reply = ask(model, messages, recorder.n_replies(stage, messages))
-    recorder.add(stage, messages, reply, model.name)
-    return reply
+        raise DesignError(str(error) or "stopped", recorder, status) from error
 
 
 def correct_until_passing(
-    model: Model,
     recorder: Recorder,
     request: list[Message],
     reply: str,
@@ -81,10 +72,10 @@ def correct_until_passing(
             return result
         if number < MAX_ATTEMPTS:
             request = prompts.correct(request, reply, errors)
-            reply = ask_and_record(model, recorder, "correct", request)
+            reply = recorder.ask("correct", request)
             result, errors = examine(reply)
     reason = f"none of {MAX_ATTEMPTS} attempts passed; the last one failed: {_summarise(errors)}"
-    raise DesignError(f"task {recorder.task!r}: {reason}", recorder, model.name)
+    raise DesignError(f"task {recorder.task!r}: {reason}", recorder)
 
 
 def _summarise(errors: str) -> str:
@@ -113,19 +104,14 @@ def examine_reply(reply: str, task: TaskSpec, kind: FunctionKind, steps: Steps |
 
 @dataclass(frozen=True)
 class Conversation:
-    """A model, and the requests to it about a task. Every reply is recorded."""
+    """The requests to a model about a task."""
 
     task: TaskSpec
     kind: FunctionKind
-    model: Model
     recorder: Recorder
     on_message: Callable[[str], None]
     steps: Steps | None = None
     """The steps that functions are tried on. The default is random steps of the environment."""
-
-    def ask(self, stage: Stage, messages: Sequence[Message]) -> str:
-        """Return a new reply to a request."""
-        return ask_and_record(self.model, self.recorder, stage, messages)
 
     def start(self, candidates: int, pre_verification: bool) -> tuple[list[Message], str]:
         """Ask for candidates and their combination. Return the last request and the reply to it.
@@ -133,7 +119,7 @@ class Conversation:
         Only candidates that pass verification are combined. If none passes, or without pre-verification, all are combined.
         """
         request = prompts.candidate(self.task, self.kind)
-        replies = [self.ask("candidate", request) for _ in range(candidates)]
+        replies = [self.recorder.ask("candidate", request) for _ in range(candidates)]
         if candidates == 1:
             return request, replies[0]
         passing = []
@@ -143,7 +129,7 @@ class Conversation:
                 self.on_message(f"candidate {number}: {_summarise(attempt.verdict.errors)}")
             passing = [attempt.reply for attempt in attempts if attempt.verdict.passed]
         request = prompts.combine(self.task, passing or list(map(prompts.quote, replies)), self.kind)
-        return request, self.ask("combine", request)
+        return request, self.recorder.ask("combine", request)
 
     def correct(self, request: list[Message], reply: str) -> Attempt:
         """Verify a reply, and ask for corrections until one passes. Raises `DesignError` if no attempt has passed."""
@@ -152,20 +138,20 @@ class Conversation:
             attempt = self._examine(reply)
             return attempt, attempt.verdict.errors
 
-        return correct_until_passing(self.model, self.recorder, request, reply, examine, self.on_message)
+        return correct_until_passing(self.recorder, request, reply, examine, self.on_message)
 
     def accept(self, reply: str) -> Attempt:
         """Accept a reply that can be read: the ablation without pre-verification. Raises `DesignError` if it cannot be read."""
         attempt = self._examine(reply)
         if attempt.verdict.graph is None:
             reason = f"the reply cannot be read: {_summarise(attempt.verdict.errors)}"
-            raise DesignError(f"task {self.task.name!r}: {reason}", self.recorder, self.model.name)
+            raise DesignError(f"task {self.task.name!r}: {reason}", self.recorder)
         return attempt._replace(verdict=Verdict((Check("read", True),), attempt.verdict.graph))
 
     def to_function(self, attempt: Attempt) -> LatentFunction:
         """Return the latent function of an attempt."""
         function = function_from_verdict(attempt.source, self.task, self.kind, attempt.verdict)
-        return self.add_exchanges(replace(function, model=self.model.name))
+        return self.add_exchanges(replace(function, model=self.recorder.model.name))
 
     def add_exchanges(self, function: LatentFunction) -> LatentFunction:
         """Return the function with all exchanges so far."""
@@ -229,9 +215,9 @@ def design(
     model = recorded_model(task.name, kind, draw) if model is None else as_model(model)
     sample_steps(task, steps)  # an environment that does not run is found before a model is paid
     path = None if record is None else Path(record)
-    recorder = Recorder(task.name, kind, getattr(model, "temperature", None), path)
-    conversation = Conversation(task, kind, model, recorder, on_message, steps)
-    with keep_replies(recorder, model):
+    recorder = Recorder(model, task.name, kind, path)
+    conversation = Conversation(task, kind, recorder, on_message, steps)
+    with keep_replies(recorder):
         request, reply = conversation.start(candidates, pre_verification)
         attempt = conversation.correct(request, reply) if pre_verification else conversation.accept(reply)
     return conversation.to_function(attempt)

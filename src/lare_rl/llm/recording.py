@@ -1,22 +1,18 @@
 """Recordings: a model's replies to exact requests, saved in a file, and the model that answers from them."""
 
-import datetime
 import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
-from pathlib import Path
 from typing import Literal
 
 from lare_rl.errors import CheckedModel, LareError
-from lare_rl.llm.key import redact_key
 from lare_rl.llm.prompts import N_CANDIDATES, Message, Stage
-from lare_rl.util.files import check_new_path, write_bytes
-from lare_rl.util.safe_io import read_json_object, read_text
+from lare_rl.util.safe_io import read_json_object
 
 __all__ = [
-    "RECORDED", "SHIPPED_RECORDINGS", "Exchange", "RecordedModel", "Recorder", "read_recording", "shipped_recordings",
+    "RECORDED", "SHIPPED_RECORDINGS", "Exchange", "RecordedModel", "Recording", "RecordingKind", "read_recording", "shipped_recordings",
 ]  # fmt: skip
 
 RecordingKind = Literal["factors", "reward", "events"]
@@ -124,73 +120,3 @@ class RecordedModel:
 def _without_lines(messages: Sequence[Message]) -> list[tuple[str, str]]:
     """Return role and content of messages, without the numbers of lines."""
     return [(message["role"], re.sub(r"\bline \d+\b", "line", message["content"])) for message in messages]
-
-
-@dataclass
-class Recorder:
-    """Records every exchange of a design. With a `path`, it saves them to this file after each reply.
-
-    Other files are never overwritten: the file must not exist at first, or be a recording of the same task and kind with exactly
-    the `exchanges` that are passed here. After each reply it is replaced as a whole, so that no reply is lost.
-    """
-
-    task: str
-    kind: RecordingKind
-    temperature: float | None = None
-    path: Path | None = None
-    exchanges: list[Exchange] = field(default_factory=list)
-    owns_file: bool = field(init=False, default=False)
-    """Whether the file at `path` is this recorder's, so that it may be replaced."""
-
-    def __post_init__(self) -> None:
-        if self.path is not None:
-            self.owns_file = self._is_recorded(self.path)
-            if not self.owns_file:
-                check_new_path(self.path)  # before a model is asked and paid
-
-    def _is_recorded(self, path: Path) -> bool:
-        """Return whether a file is a recording of the exchanges so far, of the same task and kind, as they are saved: without the key."""
-        try:
-            saved = read_recording(read_text(path), str(path))
-        except LareError:
-            return False
-        current, keys = read_recording(self.to_json(""), ""), {"task", "kind", "exchanges"}
-        return saved.model_dump(include=keys) == current.model_dump(include=keys)
-
-    def n_replies(self, stage: Stage, messages: Sequence[Message]) -> int:
-        """Return the number of recorded replies to a request."""
-        request = stage, list(messages)
-        return sum(len(x.replies) for x in self.exchanges if (x.stage, x.messages) == request)
-
-    def add(self, stage: Stage, messages: Sequence[Message], reply: str, model: str) -> None:
-        """Add a reply to a request. If the last request was the same, the reply is added to its replies.
-
-        `model` is the name of the model that replied. A file has one name: that of its last reply.
-        """
-        last = self.exchanges[-1:]
-        is_same = [(exchange.stage, exchange.messages) for exchange in last] == [(stage, list(messages))]
-        earlier = last[0].replies if is_same else []
-        exchange = Exchange(stage=stage, messages=list(messages), replies=[*earlier, reply])  # it may be refused
-        self.exchanges[len(self.exchanges) - is_same :] = [exchange]
-        if self.path is not None:
-            self.save(self.path, model, new=not self.owns_file)
-            self.owns_file = True
-
-    def save(self, path: Path, model: str, new: bool = True) -> None:
-        """Write the recording to a file. Raises `LareError` if the file cannot be written, or it exists and should be `new`."""
-        if new:
-            check_new_path(path)
-        write_bytes(path, self.to_json(model).encode())
-
-    def to_json(self, model: str) -> str:
-        """Return the content of the file, without the key."""
-        recording = Recording(
-            task=self.task,
-            kind=self.kind,
-            draw=0,
-            model=model,
-            recorded=datetime.date.today().isoformat(),
-            temperature=self.temperature,
-            exchanges=self.exchanges,
-        )
-        return redact_key(recording.model_dump_json(indent=1)) + "\n"

@@ -22,7 +22,8 @@ from lare_rl.latent.design import Conversation
 from lare_rl.latent.function import LatentFunction, normalise_source
 from lare_rl.llm import prompts
 from lare_rl.llm.model import Model, ModelFunction, as_model
-from lare_rl.llm.recording import Exchange, Recorder
+from lare_rl.llm.recorder import Recorder
+from lare_rl.llm.recording import Exchange
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.runs.directory import Run, as_run
 from lare_rl.tasks.spec import TaskSpec, require_role, select_sides
@@ -69,8 +70,8 @@ def reflect(
     role, model, rounds = require_role(resolve_task(task)), as_model(model), check_count("rounds", rounds)
     exchanges = [Exchange(**exchange) for exchange in function.exchanges]
     path = None if record is None else Path(record)
-    recorder = Recorder(role.name, function.kind, getattr(model, "temperature", None), path, exchanges)
-    conversation = Conversation(role, function.kind, model, recorder, on_message)
+    recorder = Recorder(model, role.name, function.kind, path, exchanges)
+    conversation = Conversation(role, function.kind, recorder, on_message)
     try:
         if episodes is None:
             episodes = play_episodes(role, N_EPISODES, policy)
@@ -89,7 +90,7 @@ def reflect(
         try:
             evidence = "\n".join([*assessment.ranges, *assessment.sentences])
             request = prompts.reflect(role, _find_reply(best), evidence, function.kind)
-            attempt = conversation.correct(request, conversation.ask("reflect", request))
+            attempt = conversation.correct(request, recorder.ask("reflect", request))
             candidate = conversation.to_function(attempt)
             candidate_assessment = assess_function(candidate, role, episodes)
         except LareError as error:

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from lare_rl.errors import LareError
-from lare_rl.latent.design import ask_and_record, correct_until_passing, keep_replies
+from lare_rl.latent.design import correct_until_passing, keep_replies
 from lare_rl.latent.function import normalise_source
 from lare_rl.llm.model import Model, ModelFunction, as_model
 from lare_rl.llm.prompts import Message
-from lare_rl.llm.recording import Recorder
+from lare_rl.llm.recorder import Recorder
 from lare_rl.llm.reply import parse_reply
 from lare_rl.phi.turn_program import shorten
 from lare_rl.turns.messages import Turn, read_function, to_json
@@ -56,7 +56,7 @@ def design_turn_phi(
     model = as_model(model)
     request = turn_request(goal, tools, choose_examples(turns) if examples is None else examples)
     path = None if record is None else Path(record)
-    recorder = Recorder("turns", "events", getattr(model, "temperature", None), path)
+    recorder = Recorder(model, "turns", "events", path)
 
     def examine(reply: str) -> tuple[TurnPhi | None, str]:
         try:
@@ -65,9 +65,9 @@ def design_turn_phi(
             return None, replace_surrogates(str(error))
         return phi, replace_surrogates(find_problems(phi, turns))
 
-    with keep_replies(recorder, model):
-        reply = ask_and_record(model, recorder, "candidate", request)
-        phi = correct_until_passing(model, recorder, request, reply, examine)
+    with keep_replies(recorder):
+        reply = recorder.ask("candidate", request)
+        phi = correct_until_passing(recorder, request, reply, examine)
     assert phi is not None  # because it has passed
     return replace(phi, model=model.name)
 

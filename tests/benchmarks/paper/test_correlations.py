@@ -1,9 +1,10 @@
 import numpy as np
 
+from helpers.scripted_model import ScriptedModel
 from helpers.toy_envs import toy_spec
 from lare_rl.envs.load import load_task
 from lare_rl.latent.design import DesignError
-from lare_rl.llm.recording import Recorder
+from lare_rl.llm.recorder import Recorder
 from paper import correlations
 from paper.exhibits import budgets
 
@@ -42,7 +43,7 @@ def test_the_page(monkeypatch):
 def test_a_draw_of_which_nothing_passes_is_counted(phi, monkeypatch):
     def design(task, draw):
         if draw == 1:
-            raise DesignError("no attempt passed", Recorder(task.name, "factors", None), "recorded")
+            raise DesignError("no attempt passed", Recorder(ScriptedModel(), task.name, "factors"))
         return phi
 
     monkeypatch.setattr(correlations, "design", design)
