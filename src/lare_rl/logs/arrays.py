@@ -1,5 +1,6 @@
 """Logs of NumPy arrays: directories with an .npz file for each episode, and logs in memory."""
 
+import contextlib
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -30,9 +31,7 @@ class ArrayLog(Log):
         with atomic_output(Path(out), overwrite) as directory:
             directory.mkdir()
             for number, (episode, r_hat) in enumerate(episodes):
-                if bad := next((key for key, value in episode.contents.items() if _has_objects(value)), None):
-                    raise LareError(f"{episode.name}: {bad} is no array of numbers or texts: leave it out")
-                contents = {key: _without_objects(value) for key, value in episode.contents.items()}
+                contents = _without_objects(episode.name, episode.contents)
                 arrays = {**contents, "rewards": r_hat, "paid": episode.reward}
                 with (directory / self.file_name(number, episode.name)).open("xb") as file:
                     write_npz(file, arrays)
@@ -98,24 +97,22 @@ class ListLog(ArrayLog):
         """Raise `LareError` if `out` cannot be written, or if an array of the first episode cannot be saved."""
         super().check_output(out, overwrite)
         for name, arrays, _ in itertools.islice(self.read(), 1):  # reading all may take long
-            for key, value in arrays.items():
-                if _has_objects(value):
-                    raise LareError(
-                        f"{name}: {key} is no array of numbers or texts, but {short_repr(value)}: leave it out"
-                    )
+            _without_objects(name, arrays)
 
 
-def _without_objects(value: Any) -> np.ndarray:
-    """Return an array. Texts that are Python objects, as of pandas, become an array of texts."""
-    array = np.asarray(value)
-    return np.array(array.tolist()) if array.dtype.hasobject else array
+def _without_objects(name: str, contents: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return the arrays of an episode. Texts that are Python objects, as of pandas, become arrays of texts.
 
-
-def _has_objects(value: Any) -> bool:
-    try:
-        return _without_objects(value).dtype.hasobject
-    except (TypeError, ValueError, RuntimeError):  # unequal lengths; objects that do not convert
-        return True
+    Raises `LareError` for other objects, which are not saved.
+    """
+    arrays = {}
+    for key, value in contents.items():
+        with contextlib.suppress(TypeError, ValueError, RuntimeError):  # unequal lengths; objects that do not convert
+            array = np.asarray(value)
+            arrays[key] = np.array(array.tolist()) if array.dtype.hasobject else array
+        if key not in arrays or arrays[key].dtype.hasobject:
+            raise LareError(f"{name}: {key} is no array of numbers or texts, but {short_repr(value)}: leave it out")
+    return arrays
 
 
 class FlatLog(ListLog):
