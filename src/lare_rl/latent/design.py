@@ -80,8 +80,8 @@ def correct_until_passing(
 
 def _summarise(errors: str) -> str:
     """Return the first error and the number of the others, in one line; "passes" if there is none."""
-    first, *others = errors.splitlines() or ["passes"]
-    return first + (f" (and {len(others)} more)" if others else "")
+    lines = errors.splitlines() or ["passes"]
+    return lines[0] + (f" (and {len(lines) - 1} more)" if len(lines) > 1 else "")
 
 
 class Attempt(NamedTuple):
