@@ -41,7 +41,7 @@ QUICK = ["--xla_backend_optimization_level=0"]
 if jax.__version_info__ < (0, 11):
     QUICK += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *QUICK]).strip()
-# There are as many test processes as cores, so more threads in a process (t-SNE, linear algebra) would only wait for a core.
+# There are as many test processes as cores, so more threads in a process (linear algebra) would only wait for a core.
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 for option, value in CACHE.items():

@@ -1,14 +1,11 @@
-from dataclasses import replace
-from functools import partial
-from pathlib import Path, PureWindowsPath
-from types import SimpleNamespace
+from pathlib import Path
 
-from helpers.toy_envs import toy_spec
+import pytest
+
 from lare_rl.compare.collect import collect_results
 from lare_rl.compare.labels import find_differences, label_runs
 from lare_rl.compare.messages import to_text
-from lare_rl.compare.scores import group_results
-from lare_rl.runs.directory import Run
+from lare_rl.runs.directory import Run, open_without_functions
 
 
 def change_run(run, **changes):
@@ -27,28 +24,56 @@ def test_task_defaults_do_not_split_labels():
     """Reacher-v4 scores the observation before a step, Walker2d-v4 the one after it."""
     root = Path(__file__).parents[2] / "benchmarks" / "results" / "reproduce" / "laptop"
     methods = ("dense-td3", "rrdu-td3", "lare-rrdu-td3-draw0")
-    results, _ = collect_results([root / task / method for method in methods for task in ("Reacher-v4", "Walker2d-v4")])
-    groups = group_results(results)
-    assert [group.label for group in groups] == ["dense", "rrdu", "lare-rrdu"]
-    assert groups[0].tasks == ("Reacher-v4", "Walker2d-v4")
+    runs = [
+        open_without_functions(root / task / method) for method in methods for task in ("Reacher-v4", "Walker2d-v4")
+    ]
+    assert list(label_runs(runs)) == ["dense", "rrdu", "lare-rrdu"]
 
 
-def test_settings_and_algorithms_split_labels(make_run):
-    slow = {"credit": {"learning_rate": 1e-4}}
-    runs = [make_run("a", [1.0], method="rd"), make_run("b", [2.0], method="rd", **slow), make_run("c", [3.0])]
-    assert list(label_runs(runs)) == ["rd, credit.learning_rate 0.0003", "rd, credit.learning_rate 0.0001", "dense"]
-    runs.append(make_run("d", [3.0], algorithm="ddpg"))
-    assert list(label_runs(runs))[1:] == ["rd, td3, credit.learning_rate 0.0001", "dense, td3", "dense, ddpg"]
+RD, SLOW = {"method": "rd"}, {"method": "rd", "credit": {"learning_rate": 1e-4}}
+SHORT, LONG = {"td3": {"warmup": 10}}, {"td3": {"warmup": 20}}
+LARE_RD, AFTER = {"method": "lare-rd"}, {"scored_observation": "after"}
 
 
-def test_differences_between_tasks_do_not_split_labels(make_run):
-    """Unless there is also a difference on one task."""
-    runs = [make_run("a", [1.0], td3={"warmup": 10}), make_run("a", [2.0], "Depot", td3={"warmup": 20})]
-    assert sizes(runs) == {"dense": 2}
-    runs.append(make_run("b", [3.0], td3={"warmup": 20}))
-    assert sizes(runs) == {"dense, td3.warmup 10": 1, "dense, td3.warmup 20": 2}
-    runs = [make_run("c", [1.0], algorithm="td3"), make_run("c", [2.0], "Depot", algorithm="ddpg")]
-    assert sizes(runs) == {"dense": 2}
+@pytest.mark.parametrize(
+    ("runs", "expected"),
+    [
+        # Settings, and algorithms.
+        (
+            [("a", "Chase", RD), ("b", "Chase", SLOW), ("c", "Chase", {})],
+            {"rd, credit.learning_rate 0.0003": 1, "rd, credit.learning_rate 0.0001": 1, "dense": 1},
+        ),
+        ([("a", "Chase", {}), ("b", "Chase", {"algorithm": "ddpg"})], {"dense, td3": 1, "dense, ddpg": 1}),
+        # Differences between tasks split no label, unless there is also one on a single task.
+        ([("a", "Chase", SHORT), ("a", "Depot", LONG)], {"dense": 2}),
+        (
+            [("a", "Chase", SHORT), ("a", "Depot", LONG), ("b", "Chase", LONG)],
+            {"dense, td3.warmup 10": 1, "dense, td3.warmup 20": 2},
+        ),
+        ([("c", "Chase", {"algorithm": "td3"}), ("c", "Depot", {"algorithm": "ddpg"})], {"dense": 2}),
+        # Directories, if two runs have a seed in common. Runs of other seeds are more seeds of the same label.
+        ([("old", "Chase", {}), ("more", "Chase", {"seed": 1})], {"dense": 2}),
+        (
+            [("old", "Chase", {}), ("new", "Chase", {"evaluation_episodes": 3}), ("more", "Chase", {"seed": 1})],
+            {"dense, old": 1, "dense, new": 1, "dense, more": 1},
+        ),
+        ([("old", "Chase", {}), ("old", "Reacher-v4", {})], {"dense": 2}),
+        ([("one/dense", "Chase", {}), ("two/dense", "Chase", {})], {"dense, one": 1, "dense, two": 1}),
+        # Settings without effect split no label.
+        (
+            [("a", "Chase", LARE_RD), ("b", "Chase", LARE_RD | {"scored_observation": "before", "seed": 1})],
+            {"lare-rd": 2},
+        ),
+        (
+            [("a", "Chase", {}), ("b", "Chase", AFTER | {"credit": {"hidden": (8,)}, "draw": 3, "seed": 1})],
+            {"dense": 2},
+        ),
+        ([("a", "Chase", LARE_RD | AFTER), ("b", "Chase", {})], {"lare-rd": 1, "dense": 1}),
+    ],
+)
+def test_split_labels(runs, expected, make_run):
+    made_runs = [make_run(name, [1.0], task, **settings) for name, task, settings in runs]
+    assert list(sizes(made_runs).items()) == list(expected.items())
 
 
 def test_functions_split_labels(make_run):
@@ -61,36 +86,6 @@ def test_functions_split_labels(make_run):
     assert sizes(runs[:2]) == {"lare-rd": 2}
     runs[1] = change_run(make_run("d", [2.0], method="lare-rd", draw=1), function_sha256=b)
     assert sizes(runs[:2]) == {"lare-rd": 2}
-
-
-def test_directories_split_labels(make_run):
-    """If two runs have a seed in common. Runs of other seeds are more seeds of the same label."""
-    old, new = make_run("old", [1.0]), make_run("new", [2.0], evaluation_episodes=3)
-    more = make_run("more", [3.0], seed=1)
-    assert sizes([old, more]) == {"dense": 2}
-    assert list(label_runs([old, new, more])) == ["dense, old", "dense, new", "dense, more"]
-    assert sizes([old, make_run("old", [1.0], "Reacher-v4")]) == {"dense": 2}
-    sweeps = [make_run(f"{sweep}/dense-td3", [1.0]) for sweep in ("one", "two")]
-    assert list(label_runs(sweeps)) == ["dense, one", "dense, two"]
-
-
-def test_directories_on_two_drives(make_run):
-    runs = []
-    for drive in "CD":
-        directory = SimpleNamespace(resolve=partial(PureWindowsPath, f"{drive}:/runs/new"))
-        runs.append(replace(make_run(drive, [1.0]), directory=directory))
-    assert list(label_runs(runs)) == ["dense, C:", "dense, D:"]
-
-
-def test_settings_without_effect_do_not_split_labels(make_run):
-    default = {"scored_observation": toy_spec().scored_observation, "seed": 1}
-    runs = [make_run("a", [1.0], method="lare-rd"), make_run("b", [2.0], method="lare-rd", **default)]
-    assert sizes(runs) == {"lare-rd": 2}
-    unused = {"scored_observation": "after", "credit": {"hidden": (8,)}, "draw": 3, "seed": 1}
-    runs = [make_run("c", [1.0]), make_run("d", [2.0], **unused)]
-    assert sizes(runs) == {"dense": 2}
-    runs = [make_run("e", [1.0], method="lare-rd", scored_observation="after"), runs[0]]
-    assert list(label_runs(runs)) == ["lare-rd", "dense"]
 
 
 def test_find_differences(make_run):

@@ -1,26 +1,13 @@
 """Tables of metrics: their columns, and their files."""
 
-import csv
 import sys
 
 import pytest
 
-from lare_rl.compare.metric_tables import KEYS, read_metric_rows, write_table
+from lare_rl.compare.metric_tables import read_metric_rows, write_table
 from lare_rl.errors import LareError
 
 ROWS = [{"task": "a", "seed": 0, "step": 1, "zeta": 0.5}, {"task": "a", "seed": 0, "step": 2, "alpha": 1.5}]
-
-
-def test_keys_come_first_and_missing_values_are_empty(tmp_path):
-    parquet = pytest.importorskip("pyarrow.parquet")
-    csv_path, parquet_path = write_table(ROWS, tmp_path / "results-0.5")
-    assert (csv_path.name, parquet_path.name) == ("results-0.5.csv", "results-0.5.parquet")
-    header, *lines = csv.reader(csv_path.read_text().splitlines())
-    assert header == [*KEYS, "alpha", "zeta"]
-    assert [line[-3:] for line in lines] == [["1", "", "0.5"], ["2", "1.5", ""]]
-    table = parquet.read_table(parquet_path)
-    assert table.column_names == header
-    assert [table[name].to_pylist() for name in header[-3:]] == [[1, 2], [None, 1.5], [0.5, None]]
 
 
 def test_damaged_run_is_left_out(make_run):

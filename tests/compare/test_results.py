@@ -52,14 +52,6 @@ def test_table_and_run(write_csv, run):
         collect_results((path.with_name("none.csv"),))
 
 
-def test_baseline_of_command(write_csv, run, command, tmp_path):
-    path = write_csv(method_rows("mine"))
-    status, out, error = command("compare", path, run.directory, "--out", tmp_path / "page.html")
-    assert (status, error) == (0, "")
-    assert "mine (baseline)" in out
-    assert "dense (baseline)" not in out
-
-
 def test_other_tasks_and_steps(write_csv, run):
     """A table of a whole study can be compared with the runs of one of its tasks."""
     rows = method_rows("mine")
@@ -70,7 +62,7 @@ def test_other_tasks_and_steps(write_csv, run):
         ("other_steps", None, 100),
     ]
     (group, _) = compare(results).groups.values()
-    assert (group.tasks, group.steps) == (("Chase",), (50,))
+    assert (group.task, group.steps) == ("Chase", (50,))
 
 
 def test_same_seed_twice(write_csv, run):

@@ -16,9 +16,9 @@ from lare_rl.errors import LareError
 from lare_rl.evaluation.cross_play import cross_play
 from lare_rl.evaluation.played_episodes import play_run
 from lare_rl.evaluation.video import record_frames
-from lare_rl.report import run_details
 from lare_rl.report.overview import render_learning_curves
 from lare_rl.report.reported_run import ReportedRun
+from lare_rl.report.run_details import render_details
 from lare_rl.training.collect_device import unroll_on_device
 from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_learner
@@ -44,7 +44,7 @@ def test_rollout(runs):
     assert played.reward.shape == played.proxy_reward.shape == played.credit.shape == (25, 1, 8)
     assert played.proxy_reward.std() > 0
     assert played.select_episode(played.reward).shape == (25, 8)
-    assert [frame.shape for frame in record_frames(runs[0], played=played)[0]] == [(400, 400, 3)] * 25
+    assert [frame.shape for frame in record_frames(runs[0])[0]] == [(400, 400, 3)] * 25
 
 
 def test_cross_play(runs, command):
@@ -99,16 +99,15 @@ def test_evaluate_command(runs, command, tmp_path):
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF8")
 
 
-def test_report(runs, monkeypatch):
-    monkeypatch.setattr(run_details, "MAX_TSNE_POINTS", 50)
+def test_report(runs):
     run = runs[0]
-    details = "\n".join(run_details.render_details(run, played=play_run(run)))
+    details = "\n".join(render_details(run))
     check_markup(details.replace('href="#', 'href="'))
     assert "nan" not in details
     for role in run.config.task.roles:
-        assert details.count(f"<summary>The latent function of {role.name}</summary>") == 1
+        assert details.count(f"<summary>The latent function phi of {role.name}</summary>") == 1
     assert details.count('class="strip"') == 2  # true and proxy rewards
-    assert details.count("<figcaption>t-SNE") == 4
+    assert details.count("correlation with the true reward") == 2
     curves = "\n".join(render_learning_curves(run.config.task, [ReportedRun("a", run)], np.zeros((2, 0))))
     titles = re.findall(r"team of (\w+)</", curves)
     assert set(titles) == {"predator", "prey"}

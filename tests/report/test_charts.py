@@ -1,13 +1,10 @@
-import base64
-import io
 import re
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from helpers.markup import check_markup
-from lare_rl.report.charts import Bar, Chart, Line, draw_bars, draw_points, draw_strips, visible_steps
+from lare_rl.report.charts import Bar, Chart, Line, draw_bars, draw_strips, visible_steps
 
 X = np.arange(3.0)
 
@@ -54,40 +51,6 @@ def test_missing_and_equal_values():
     assert lines[0][1] < lines[0][0] == lines[1][0] < lines[2][0] < 1000
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "labels"),
-    [
-        (10.01, 10.03, ["10.01", "10.015", "10.02", "10.025", "10.03"]),
-        (100.0, 111.0, ["100", "102.5", "105", "107.5", "110"]),
-        (1000.0, 1001.0, ["1,000", "1,000.2", "1,000.4", "1,000.6", "1,000.8", "1,001"]),
-        (-1.0, 1.0, ["-1", "-0.5", "0", "0.5", "1"]),
-    ],
-)
-def test_ticks_have_the_digits_that_they_need(low, high, labels):
-    html = chart(Line(X, X, "c0"), limits=(low, high))
-    assert re.findall(r'<span class="y"[^>]*>([^<]*)<', html) == labels
-    assert f"--digits:{max(map(len, labels))};" in html
-
-
-def test_wide_bands_do_not_flatten_a_line():
-    lines = heights(chart(*[Line(X, X, "c0", band=np.full(3, 1000.0))] * 4))
-    assert max(lines[0]) - min(lines[0]) > 450
-
-
-def test_labels_do_not_overlap():
-    lines = [*(Line(X, X + i / 100, "c0", f"line {i}") for i in range(6)), Line(X, X - 9, "c0", "low")]
-    html = chart(*lines, label_gap=(gap := 9.0))
-    tops = [float(top) for top in re.findall(r'class="label[^>]*top:([\d.]+)%', html)]
-    assert min(np.diff(sorted(tops))) > gap - 0.1
-    assert min(tops) >= 0
-    assert 50 <= max(tops) <= 100
-
-
-def test_a_label_outside_fixed_limits_does_not_move_others():
-    html = chart(Line(X, X - 6, "c0", "low"), Line(X, X / 2, "c1", "high"), limits=(-1.0, 1.0))
-    assert re.findall(r'class="label[^>]*top:([-\d.]+)%', html) == ["100.0", "0.0"]
-
-
 def test_bars_point_to_the_side_of_their_amounts():
     html = draw_bars([Bar("<speed>", "f", 0.9, "plus", "more"), Bar("cost", "g", -0.3, "minus", "less")])
     check_markup(html)
@@ -112,15 +75,3 @@ def test_strips_share_a_scale_if_they_are_comparable():
     assert images[0] != images[1]
     assert other_images[0] == other_images[1]
     assert len(shared) < 5000
-
-
-def test_points():
-    """The largest value is yellow, the smallest one dark, and between the points there is nothing."""
-    points = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
-    html = draw_points(points, np.array([0.0, 1.0, 2.0, 3.0]), "points")
-    check_markup(html)
-    (data,) = re.findall(r"base64,([^\"]+)", html)
-    pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGBA")).astype(int)
-    assert abs(pixels[4, 4, :3] - (68, 1, 84)).max() < 20
-    assert abs(pixels[-5, -5, :3] - (253, 231, 37)).max() < 20
-    assert pixels[pixels.shape[0] // 2, pixels.shape[1] // 2, 3] == 0

@@ -99,7 +99,7 @@ def compare(
     comparisons, overall = page.write_comparisons(results, out, ScoreChoice(metric, at, late), findings)
     for comparison in comparisons:
         if len(comparisons) > 1:
-            print_line(f"\n{comparison.tasks[0]}")
+            print_line(f"\n{comparison.task}")
         print_table(*page.comparison_table(comparison))
         print_line(page.describe(comparison))
     if overall:

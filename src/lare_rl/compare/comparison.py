@@ -22,7 +22,7 @@ from lare_rl.compare.bootstrap import (
     two_sided_p,
 )
 from lare_rl.compare.results import LearningCurve
-from lare_rl.compare.scores import LAST_RETURN, LabelScores, ScoreChoice, group_results, has_common_scale
+from lare_rl.compare.scores import LAST_RETURN, LabelScores, ScoreChoice, group_results
 from lare_rl.util.statistics import Band, sample_std
 
 __all__ = ["Comparison", "OverallRow", "Row", "compare", "compare_over_tasks", "compare_tasks"]
@@ -30,7 +30,7 @@ __all__ = ["Comparison", "OverallRow", "Row", "compare", "compare_over_tasks", "
 
 @dataclass(frozen=True)
 class OverallRow:
-    """One method compared with the baseline over tasks whose scores need no common scale."""
+    """One method compared with the baseline, on a task or over several."""
 
     label: str
     n_seeds: int
@@ -42,14 +42,14 @@ class OverallRow:
 
 @dataclass(frozen=True)
 class Row(OverallRow):
-    """One method, over tasks whose scores have a common scale."""
+    """One method on a task."""
 
     n_draws: int
     iqm: Estimate
     """Interquartile mean, its interval over the seeds."""
     mean: float
     std: float | None
-    """Standard deviation over the seeds of their means over the tasks; None for a single seed."""
+    """Standard deviation over the seeds; None for a single seed."""
     draw_mean: Estimate | None
     """The mean, its interval over the draws; None for a single draw."""
     difference: Estimate | None
@@ -58,7 +58,7 @@ class Row(OverallRow):
 
 @dataclass(frozen=True)
 class Comparison:
-    """The statistics of some methods. The first method is the baseline."""
+    """The statistics of some methods on a task. The first method is the baseline."""
 
     rows: tuple[Row, ...]
     curves: Mapping[str, Band]
@@ -70,14 +70,9 @@ class Comparison:
     choice: ScoreChoice
 
     @property
-    def tasks(self) -> tuple[str, ...]:
-        """The names of the tasks."""
-        return self.groups[self.rows[0].label].tasks
-
-    @property
-    def normalised(self) -> bool:
-        """Whether scores are scaled, as those of several tasks are."""
-        return len(self.tasks) > 1
+    def task(self) -> str:
+        """The name of the task."""
+        return self.groups[self.rows[0].label].task
 
     @property
     def last_step(self) -> int:
@@ -86,9 +81,9 @@ class Comparison:
 
 
 def compare(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_RETURN) -> Comparison:
-    """Compare results by their labels. The first label is the baseline. All labels have the same tasks.
+    """Compare the results of a task by their labels. The first label is the baseline.
 
-    Raises `LareError` if some results are missing.
+    Raises `LareError` if some results are missing, or they are of several tasks.
     """
     groups = group_results(results, choice)
     seed_scores = {group.label: group.seed_scores for group in groups}
@@ -109,10 +104,8 @@ def compare(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_RETURN)
 
 
 def compare_tasks(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_RETURN) -> list[Comparison]:
-    """Compare all tasks together, or each task alone if their scores have no common scale."""
+    """Compare results on each task, as `compare` does."""
     tasks = sorted({result.task for result in results})
-    if has_common_scale(tasks, choice.metric):
-        return [compare(results, choice)]
     return [compare([result for result in results if result.task == task], choice) for task in tasks]
 
 
@@ -142,7 +135,6 @@ def compare_over_tasks(comparisons: Sequence[Comparison]) -> list[OverallRow]:
 
 def _make_row(group: LabelScores, baseline: Scores | None) -> Row:
     scores = group.seed_scores
-    seed_means = scores.mean(axis=1)
     improvement, p_value = _improvement(scores, baseline)
     draw_mean = difference = None
     if len(group.draws) > 1:
@@ -154,8 +146,8 @@ def _make_row(group: LabelScores, baseline: Scores | None) -> Row:
         n_seeds=len(group.seeds),
         n_draws=len(group.draws),
         iqm=estimate(interquartile_mean, scores),
-        mean=float(np.mean(seed_means)),
-        std=sample_std(seed_means) if len(seed_means) > 1 else None,
+        mean=float(scores.mean()),
+        std=sample_std(scores[:, 0]) if len(scores) > 1 else None,
         draw_mean=draw_mean,
         difference=difference,
         probability_of_improvement=improvement,

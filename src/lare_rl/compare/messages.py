@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterable, Iterator
 
 from lare_rl.compare.comparison import Comparison
-from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
 from lare_rl.util.findings import Finding, render
 
@@ -26,22 +25,18 @@ MESSAGES = {
     "origin": "All runs: {facts}.",
     # Scores.
     "scores": "Scores are {metric} on {task} {when}.",
-    "scaled_scores": "Scores are {metric} {when}, scaled linearly between two fixed returns: {scales}.",
-    "scale": "{task} (0 is {random:g}, 1 is {trained:g})",
     "true_returns": "true returns",
     "at_step": "at step {step:,}",
     "at_last_step": "at step {step:,}, the last at which all runs were evaluated",
     "late": "averaged over the evaluations after three quarters of {step:,} steps",
     # Few runs.
     "few_values": "The interval of {count} {noun} is their range, which contains the true median in {coverage:.0%} of cases, not in 95%.",
-    "few_over_tasks": "Intervals of two or three seeds, or draws, are too narrow: they contain the true median in less than 95% of "
-    "cases.",
     "min_p": "With these few runs, p is at least {p:.2g}.",
     # Legends.
-    "columns": "IQM: interquartile mean over seeds and tasks; of fewer than four scores it is the mean. sd: standard deviation over "
+    "columns": "IQM: interquartile mean over the seeds; of fewer than four scores it is the mean. sd: standard deviation over "
     "the seeds (n - 1). Minus baseline: the IQM minus the IQM of the baseline, the first method; its interval is too narrow for two or "
     "three seeds. Above baseline: the probability that a run scores more than a run of the baseline; without an interval if it is 0 "
-    "or 1 on every task. Neither is computed for a single seed. If the score is an error or a loss, a low probability is good. p: "
+    "or 1. Neither is computed for a single seed. If the score is an error or a loss, a low probability is good. p: "
     "exact two-sided Mann-Whitney test. If a method has several draws of the language model, the mean over the draws of a seed counts "
     "as one run.",
     "intervals": "Intervals: stratified bootstrap over the seeds, {repetitions} repetitions; in the column with draws, over the draws "
@@ -61,14 +56,9 @@ def find_score_meaning(comparison: Comparison) -> Finding:
     """Return what the scores are, and at which step."""
     choice = comparison.choice
     when = "late" if choice.average_last_quarter else "at_step" if choice.step is not None else "at_last_step"
-    values = {
-        "metric": Finding("true_returns") if choice.metric == RETURN else choice.metric,
-        "when": Finding(when, {"step": comparison.last_step}),
-    }
-    if not comparison.normalised:
-        return Finding("scores", {**values, "task": comparison.tasks[0]})
-    scales = (Finding("scale", {"task": task, **REFERENCE_RETURNS[task]._asdict()}) for task in comparison.tasks)
-    return Finding("scaled_scores", {**values, "scales": tuple(scales)})
+    metric = Finding("true_returns") if choice.metric == RETURN else choice.metric
+    values = {"metric": metric, "task": comparison.task, "when": Finding(when, {"step": comparison.last_step})}
+    return Finding("scores", values)
 
 
 def find_small_samples(comparison: Comparison) -> Iterator[Finding]:
@@ -78,17 +68,14 @@ def find_small_samples(comparison: Comparison) -> Iterator[Finding]:
     2.5% of the samples. The range contains the median with probability 1 - 2^(1 - n).
     """
     samples = {"seeds": {row.n_seeds for row in comparison.rows}, "draws": {row.n_draws for row in comparison.rows}}
-    small_samples = [(noun, count) for noun, counts in samples.items() for count in sorted(counts & {2, 3})]
-    if comparison.normalised and small_samples:
-        yield Finding("few_over_tasks")
-        return
-    for noun, count in small_samples:
-        yield Finding("few_values", {"noun": noun, "count": count, "coverage": 1 - 2.0 ** (1 - count)})
+    for noun, counts in samples.items():
+        for count in sorted(counts & {2, 3}):
+            yield Finding("few_values", {"noun": noun, "count": count, "coverage": 1 - 2.0 ** (1 - count)})
 
 
 def find_min_p(comparison: Comparison) -> Iterator[Finding]:
     """Report the lowest possible p, if it is not low."""
     n_seeds = comparison.rows[0].n_seeds
     n_splits = [math.comb(n_seeds + row.n_seeds, row.n_seeds) for row in comparison.rows if row.p_value is not None]
-    if n_splits and (min_p := 2 * max(n_splits) ** -len(comparison.tasks)) > MAX_MIN_P:
+    if n_splits and (min_p := 2 / max(n_splits)) > MAX_MIN_P:
         yield Finding("min_p", {"p": min_p})

@@ -41,7 +41,7 @@ def write_comparisons(
         (*_first_cells(row, number), *map(_format_cell, (row.probability_of_improvement, row.p_value)))
         for number, row in enumerate(compare_over_tasks(comparisons))
     ]
-    tasks = ", ".join(task for comparison in comparisons for task in comparison.tasks)
+    tasks = ", ".join(comparison.task for comparison in comparisons)
     n_labels = len({result.label for result in results})
     title = f"{tasks}: {n_labels} method{'s' if n_labels > 1 else ''}"
     notes = [f"Note: {render(finding, MESSAGES)}" for finding in findings]
@@ -97,12 +97,11 @@ def _body(comparisons: Sequence[Comparison], overall: Sequence[tuple[str, ...]])
     level = 2 if len(comparisons) == 1 else 3
     for comparison in comparisons:
         if len(comparisons) > 1:
-            yield f"<h2>{escape(comparison.tasks[0])}</h2>"
+            yield f"<h2>{escape(comparison.task)}</h2>"
         header, rows = comparison_table(comparison)
         yield render_table(header, rows, range(1, len(header)))
         yield render_note(describe(comparison))
-        scale = "score" if comparison.normalised else "true return"
-        score = scale if comparison.choice.metric == RETURN else comparison.choice.metric
+        score = "true return" if comparison.choice.metric == RETURN else comparison.choice.metric
         yield f"<h{level}>Learning</h{level}>"
         yield figures.draw_bands(comparison.curves, "environment steps", f"IQM of the {score}", x_is_steps=True)
         yield render_note(MESSAGES["curves"])

@@ -1,10 +1,9 @@
 """The scores of a comparison, as arrays.
 
-The *score of a run* is the value of the metric at an evaluation. If there are several tasks, the metric is the return, and it is scaled:
-0 is the return of a random policy, and 1 about the highest published return of TD3 on true rewards (`REFERENCE_RETURNS`, for some tasks).
+The *score of a run* is the value of the metric at an evaluation. Scores of different tasks have no common scale.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
@@ -14,18 +13,17 @@ from jaxtyping import Float
 
 from lare_rl.compare.results import LearningCurve, group_pairs
 from lare_rl.errors import LareError
-from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
 from lare_rl.tasks.spec import check_same_tasks
 
-__all__ = ["LAST_RETURN", "LabelScores", "ScoreChoice", "group_results", "has_common_scale", "last_quarter"]
+__all__ = ["LAST_RETURN", "LabelScores", "ScoreChoice", "group_results", "last_quarter"]
 
 
 class ScoreChoice(NamedTuple):
     """Which values of the runs are compared."""
 
     metric: str = RETURN
-    """The name of the metric. Only returns are scaled."""
+    """The name of the metric."""
     step: int | None = None
     """The step at which runs are compared; None for the last one at which all have a value."""
     average_last_quarter: bool = False
@@ -38,10 +36,10 @@ LAST_RETURN = ScoreChoice()
 
 @dataclass(frozen=True)
 class LabelScores:
-    """The scores of one label."""
+    """The scores of one label on a task. The axis `tasks` has the length 1."""
 
     label: str
-    tasks: tuple[str, ...]
+    task: str
     seeds: tuple[int, ...]
     draws: tuple[int, ...]
     steps: tuple[int, ...]
@@ -62,13 +60,14 @@ _CurveKey = tuple[str, str, int, int]
 def group_results(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_RETURN) -> list[LabelScores]:
     """Return the scores of each label: a method, and what distinguishes it from other rows.
 
-    Raises `LareError` if there are no results, a label lacks a task, draw or seed, or not all results have a value at the chosen step.
+    Raises `LareError` if there are no results, they are of several tasks, a label lacks a draw or seed, or not all results have a
+    value at the chosen step.
     """
     if not results:
         raise LareError("there are no results to compare")
-    tasks = tuple(sorted({curve.task for curve in results}))
-    if not has_common_scale(tasks, choice.metric):
-        raise LareError(f"{choice.metric} has no common scale over {', '.join(tasks)}: compare each task alone")
+    task, *others = sorted({curve.task for curve in results})
+    if others:
+        raise LareError(f"scores have no common scale over {', '.join([task, *others])}: compare each task alone")
     check_same_tasks((curve.source, curve.config.task) for curve in results if curve.config is not None)
     curves = _index_curves(results, choice.metric)
     steps = _shared_steps(curves, choice)
@@ -78,11 +77,11 @@ def group_results(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_R
         group = [curve for curve in curves.values() if curve.label == label]
         draws = tuple(sorted({curve.draw for curve in group}))
         seeds = tuple(sorted({curve.seed for curve in group}))
-        scores = _fill_scores(label, draws, seeds, tasks, steps, curves)
+        scores = _fill_scores(label, draws, seeds, task, steps, curves)
         groups.append(
             LabelScores(
                 label=label,
-                tasks=tasks,
+                task=task,
                 seeds=seeds,
                 draws=draws,
                 steps=tuple(steps),
@@ -97,35 +96,26 @@ def _fill_scores(
     label: str,
     draws: Sequence[int],
     seeds: Sequence[int],
-    tasks: Sequence[str],
+    task: str,
     steps: Sequence[int],
     curves: Mapping[_CurveKey, LearningCurve],
 ) -> Float[np.ndarray, "draws seeds tasks steps"]:
-    """Return the scores of a label. Raises `LareError` if it lacks a task, draw or seed."""
-    scores = np.empty((len(draws), len(seeds), len(tasks), len(steps)))
-    for (i, draw), (j, seed), (k, task) in product(enumerate(draws), enumerate(seeds), enumerate(tasks)):
+    """Return the scores of a label. Raises `LareError` if it lacks a draw or seed."""
+    scores = np.empty((len(draws), len(seeds), 1, len(steps)))
+    for (i, draw), (j, seed) in product(enumerate(draws), enumerate(seeds)):
         key = label, task, draw, seed
         if key not in curves:
-            hint = ", or compare each task alone" if len(tasks) > 1 else ""
             raise LareError(
-                f"{label} has no run on {task} with seed {seed} and draw {draw}, and needs the same seeds for every task and "
-                f"draw: train it, or add it to the table{hint}"
+                f"{label} has no run on {task} with seed {seed} and draw {draw}, and needs the same seeds for every draw: train it, "
+                "or add it to the table"
             )
-        scores[i, j, k] = [curves[key].values[step] for step in steps]
-    if len(tasks) > 1:
-        low, high = np.transpose([REFERENCE_RETURNS[task] for task in tasks])[..., None]  # each [tasks 1]
-        scores = (scores - low) / (high - low)
+        scores[i, j, 0] = [curves[key].values[step] for step in steps]
     return scores
 
 
 def last_quarter(steps: Sequence[int]) -> list[int]:
     """Return the steps above 3/4 of the last step. `steps` are ascending."""
     return [step for step in steps if 4 * step > 3 * steps[-1]]
-
-
-def has_common_scale(tasks: Collection[str], metric: str) -> bool:
-    """Return whether the scores of some tasks can be averaged: those of one task, or returns that can be scaled."""
-    return len(tasks) == 1 or (metric == RETURN and all(task in REFERENCE_RETURNS for task in tasks))
 
 
 def _index_curves(results: Sequence[LearningCurve], metric: str) -> dict[_CurveKey, LearningCurve]:

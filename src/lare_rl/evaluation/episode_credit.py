@@ -16,8 +16,9 @@ from lare_rl.credit.methods import METHODS, Fit
 from lare_rl.data import replay
 from lare_rl.data.replay import Index, Replay, StoredSteps
 from lare_rl.data.sampling import get_episodes
+from lare_rl.envs.interface import team_mean
 from lare_rl.runs.directory import Run
-from lare_rl.training.decoder_inputs import decoder_inputs
+from lare_rl.training.decoder_inputs import alive_agents, decoder_inputs
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import has_step_rewards, rewards
 from lare_rl.training.saved_state import load_learner
@@ -41,9 +42,9 @@ class EpisodeCredit:
     factors: Float[np.ndarray, "steps rows factors"]
     has_step_rewards: bool
     """Whether the true rewards of single steps are known: they are not if all rewards of the newest steps are payments."""
-    correlations: Float[np.ndarray, " factors"]
-    """Pearson's correlation of each factor with the true reward, over the newest steps of all seeds, about `RECENT_STEPS` of each.
-    NaN if one never varies, or step rewards are not known. Empty for many agents, and without phi."""
+    correlations: list[Float[np.ndarray, " _"]]
+    """Pearson's correlation of each factor of each team with its true reward, over the newest steps of all seeds, about
+    `RECENT_STEPS` of each. NaN if one never varies, or step rewards are not known. Empty without phi."""
 
 
 class FactorLabel(NamedTuple):
@@ -125,10 +126,18 @@ def _read_newest(learners: Learner, config: TrainConfig) -> StoredSteps:
     return jax.jit(jax.vmap(lambda buffer: replay.read(buffer, replay.newest_steps(buffer, n_steps))))(buffers)
 
 
-def _factor_correlations(steps: StoredSteps, config: TrainConfig, is_known: bool) -> Float[np.ndarray, " factors"]:
-    """Compute the correlations of a single agent's factors with its true reward."""
-    if not config.method.needs_phi or config.env.n_agents > 1:
-        return np.zeros(0)
-    reward = np.asarray(steps.columns["reward"]).ravel()
-    factors = np.asarray(steps.columns["factors"]).reshape(len(reward), -1)
-    return column_correlations(factors, reward) if is_known else np.full(factors.shape[1], np.nan)
+def _factor_correlations(
+    steps: StoredSteps, config: TrainConfig, is_known: bool
+) -> list[Float[np.ndarray, " factors"]]:
+    """Compute the correlations of each team's factors with its true reward."""
+    correlations, alive = [], np.asarray(alive_agents(steps, config))
+    for i, (team, n_factors) in enumerate(zip(config.env.teams, config.n_factors, strict=False)):
+        factors = np.asarray(steps.columns["factors"])[..., config.team_slice(i), :n_factors]
+        reward, mask = np.asarray(steps.columns["reward"])[..., team.agents], alive[..., team.agents]
+        if config.team_level:
+            reward = np.asarray(team_mean(steps.columns["reward"], alive, team))[..., None]
+            mask = np.ones_like(reward, bool)
+        correlations.append(
+            column_correlations(factors[mask], reward[mask]) if is_known else np.full(n_factors, np.nan)
+        )
+    return correlations

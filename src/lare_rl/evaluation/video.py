@@ -21,7 +21,7 @@ from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.placement import load_env_spec, make_host_env
 from lare_rl.envs.play import play_steps
 from lare_rl.errors import LareError, missing_extra_error
-from lare_rl.evaluation.played_episodes import PlayedEpisodes, play_run
+from lare_rl.evaluation.played_episodes import play_run
 from lare_rl.evaluation.policy import RunPolicy
 from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import make_jax_env
@@ -66,7 +66,6 @@ def record_frames(
     *,
     max_fps: float = MAX_GIF_FPS,
     max_frames: int | None = None,
-    played: PlayedEpisodes | None = None,
 ) -> tuple[list[Frame], float]:
     """Return the frames that `record_video` shows, and the seconds for which it shows each.
 
@@ -75,8 +74,6 @@ def record_frames(
             per second, and a film of many agents has 8.
         max_frames: the largest number of frames. A longer film ends early; that of a single agent in JAX leaves steps out, and so
             shows the episode faster.
-        played: episodes of a run with many agents; the film shows the first. By default, the policy plays new episodes. A run
-            with one agent does not use it.
 
     Raises:
         LareError: the environment cannot be drawn on this machine.
@@ -91,7 +88,7 @@ def record_frames(
             raise LareError(
                 f"{run.config.task.name} steps on the host, where only single agents are filmed: leave the video out"
             )
-        played = played or play_run(run)
+        played = play_run(run)
         frames = make_jax_env(run.config.task).frames(*played.select_episode((played.state, played.credit)))
         return frames[:max_frames], 1 / MANY_AGENTS_FPS
     policy = RunPolicy(run, best=best, deterministic=deterministic)

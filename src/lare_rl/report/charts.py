@@ -21,7 +21,7 @@ from lare_rl.report.reported_run import finite
 from lare_rl.util.findings import format_for_reader, format_number
 
 try:
-    from PIL import Image, ImageDraw
+    from PIL import Image
 except ImportError as missing:
     raise missing_extra_error("a report", "report") from missing
 
@@ -32,7 +32,6 @@ __all__ = [
     "Line",
     "draw_bars",
     "draw_legend",
-    "draw_points",
     "draw_strips",
     "visible_steps",
 ]
@@ -231,21 +230,12 @@ def draw_strips(rows: Mapping[str, Float[np.ndarray, "steps agents"]], shared_sc
         pixels = _to_colours(values.T, low, high)
         height = 28 if len(pixels) == 1 else 12 * len(pixels)
         text = f"{name}, from {format_number(low)} (dark) to {format_number(high)} (bright)"
-        image = _render_image(Image.fromarray(pixels), text, f' style="height:{height}px"')
-        strips.append(f'<figure class="strip">{image}</figure>')
+        file = io.BytesIO()
+        Image.fromarray(pixels).quantize(64, Image.Quantize.FASTOCTREE).save(file, "PNG", optimize=True)
+        source = f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
+        image = f'<img alt="{escape(text)}" style="height:{height}px" src="{source}">'
+        strips.append(f'<figure class="strip"><figcaption>{escape(text)}</figcaption>{image}</figure>')
     return "".join(strips)
-
-
-def draw_points(points: Float[np.ndarray, "points 2"], values: Float[np.ndarray, " points"], text: str) -> str:
-    """Draw points in the colours of their values. The lowest 2% have one colour, and the highest 2%."""
-    size, radius = 480, 4
-    low, high = np.percentile(values, [2, 98])
-    positions = radius + (points - points.min(axis=0)) / np.ptp(points, axis=0) * (size - 2 * radius)
-    image = Image.new("RGBA", (size, size))
-    draw = ImageDraw.Draw(image)
-    for (x, y), colour in zip(positions, _to_colours(values, low, high), strict=True):
-        draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=tuple(map(int, colour)))
-    return f"<figure>{_render_image(image, text)}</figure>"
 
 
 def visible_steps(length: int) -> slice:
@@ -258,16 +248,6 @@ def _to_colours(values: Float[np.ndarray, "*shape"], low: float, high: float) ->
     """Return the colours of numbers, from dark at `low` to bright at `high`."""
     position = np.clip((values - low) / max(high - low, 1e-12), 0, 1) * (len(_VIRIDIS) - 1)
     return np.stack([np.interp(position, range(len(_VIRIDIS)), channel) for channel in _VIRIDIS.T], -1).astype(np.uint8)
-
-
-def _render_image(image: Image.Image, text: str, style: str = "") -> str:
-    """Return an image with its text, as a PNG of 64 colours."""
-    file = io.BytesIO()
-    image.quantize(64, Image.Quantize.FASTOCTREE).save(file, "PNG", optimize=True)
-    data = base64.b64encode(file.getvalue()).decode()
-    return (
-        f'<figcaption>{escape(text)}</figcaption><img alt="{escape(text)}"{style} src="data:image/png;base64,{data}">'
-    )
 
 
 def _to_units(values: ArrayLike, low: float, high: float) -> np.ndarray:

@@ -48,26 +48,6 @@ MESSAGES = {
     "episodic": "{return_:number}{best}",
     "best_episodic": ", the best of these runs: {name}",
     "so_few_seeds": ", but so few seeds do not establish it",
-    # Several runs
-    "is_best": "{best} ends highest",
-    "few_seeds": (
-        "{best} ends higher than {second}, but with so few seeds this is not established: train with `--seeds 5`"
-    ),
-    "none_is_best": "No run is clearly the best",
-    "not_comparable": "There is no return to compare",
-    "ranking": "Final returns: {runs}{more}{seeds}.",
-    "ranked": "{name} {return_:number}{seeds}",
-    "seeds": " ({n_seeds:count seed})",
-    "seeds_each": " (means over {n_seeds:count seed} each)",
-    "and_more": ", and {count} more down to {last:number}",
-    "improvement": (
-        "A seed of {best} ends above a seed of {second} with probability {probability:.2f} (from {n_pairs:count pair} of seeds)."
-    ),
-    "episodic_discounts": (
-        "{name} learned the score at the end with gamma {gamma:g} and lambda {gae_lambda:g}. In long episodes, PPO often learns it better "
-        "with 1 for both: for a fair comparison, train `episodic` with `--ppo.gamma 1 --ppo.gae-lambda 1` too."
-    ),
-    "different_steps": "The runs ended at different steps, from {least:,} to {most:,}.",
     # The proxy rewards
     "explained": (
         "Its proxy rewards, from {inputs}, explain {amount} of the score: R² of the last returns, before they were learned from, is "

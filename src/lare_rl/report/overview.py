@@ -1,4 +1,4 @@
-"""The sections of a report that stand first: the verdict on a run, the comparison of several, and learning curves."""
+"""The sections of a report that stand first: the verdict on a run, learning curves, and final values."""
 
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -7,22 +7,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.algorithms.ppo import PPOSettings
-from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.report.charts import N_COLOURS, Chart, Line, draw_legend
 from lare_rl.report.diagnosis import diagnose
 from lare_rl.report.html import render_figures, render_fold, render_note, render_table, render_tiles
 from lare_rl.report.messages import MESSAGES, WORDS
 from lare_rl.report.reported_run import Curve, ReportedRun, finite, mean_over_seeds
-from lare_rl.report.run_summary import MIN_SEEDS, EpisodicRun, RunSummary, find_final_error, summarise_run
+from lare_rl.report.run_summary import EpisodicRun, RunSummary, find_final_error, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding, format_for_reader, format_number, render
-from lare_rl.util.statistics import format_mean_std, wins
+from lare_rl.util.statistics import format_mean_std
 
 __all__ = [
-    "compare_runs",
-    "render_comparison",
     "render_final_values",
     "render_headline",
     "render_learning_curves",
@@ -33,10 +29,6 @@ __all__ = [
     "summarise_runs",
 ]
 
-CLEAR_PROBABILITY = 0.9
-"""A run is the best if a seed of it ends above a seed of the second with this probability, and each has `MIN_SEEDS`."""
-MAX_RANKED = 5
-"""The largest number of runs that the comparing sentence names."""
 MAX_HOVER_LINES = 10
 """The largest number of lines of a text that appears at a step: the step, and a value of each run."""
 _METRICS = {
@@ -125,63 +117,9 @@ def render_trust(summary: RunSummary | None) -> Iterable[str]:
             yield f"<p>{render(finding, MESSAGES, 'html')}</p>"
 
 
-def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
-    """Return the findings that compare the final returns of runs of a task. The runs are sorted by them."""
-    finals = {reported.name: values for reported in runs if len(values := reported.final_values(RETURN))}
-    if len(finals) < 2:
-        return []
-    counts = {len(values) for values in finals.values()}
-    n_seeds = Finding("seeds_each", {"n_seeds": counts.pop()}) if len(counts) == 1 else None
-    ranked = []
-    for name, values in list(finals.items())[:MAX_RANKED]:
-        seeds = None if n_seeds else Finding("seeds", {"n_seeds": len(values)})
-        ranked.append(Finding("ranked", {"name": name, "return_": float(values.mean()), "seeds": seeds}))
-    (best, best_returns), (second, second_returns), *_ = finals.items()
-    pairs = wins(best_returns[:, None], second_returns)
-    probability, last = float(pairs.mean()), float(list(finals.values())[-1].mean())
-    n_more = len(finals) - len(ranked)
-    more = Finding("and_more", {"count": n_more, "last": last}) if n_more else None
-    names = {"best": best, "second": second}
-    has_seeds = min(len(best_returns), len(second_returns)) >= MIN_SEEDS
-    is_clear = probability >= CLEAR_PROBABILITY
-    findings = [
-        Finding("none_is_best" if not is_clear else "is_best" if has_seeds else "few_seeds", names),
-        Finding("ranking", {"runs": tuple(ranked), "more": more, "seeds": n_seeds}),
-        Finding("improvement", names | {"probability": probability, "n_pairs": pairs.size}),
-    ]
-    findings += _episodic_discounts(runs)
-    steps = {reported.last_step for reported in runs if reported.metrics}
-    if len(steps) > 1:
-        findings.append(Finding("different_steps", {"least": min(steps), "most": max(steps)}))
-    return findings
-
-
-def _episodic_discounts(runs: Sequence[ReportedRun]) -> list[Finding]:
-    """Report the discounts of PPO, if runs are compared with runs on the return of the episode alone that all discount."""
-    episodic = _episodic_runs(runs)
-    if not episodic or all(run.is_episodic for run in runs):
-        return []
-    settings = [reported.run.config.settings for reported in episodic]
-    ppo = [run.hyperparameters for run in settings if run.algorithm == "ppo"]
-    discounts = [(values.gamma, values.gae_lambda) for values in ppo if isinstance(values, PPOSettings)]
-    if (1, 1) in discounts or settings[0].algorithm != "ppo":
-        return []
-    gamma, gae_lambda = discounts[0]
-    return [Finding("episodic_discounts", {"name": episodic[0].name, "gamma": gamma, "gae_lambda": gae_lambda})]
-
-
 def sort_runs(runs: Iterable[ReportedRun]) -> list[ReportedRun]:
     """Sort runs by their final returns, the best first."""
     return sorted(runs, key=lambda reported: reported.final_return, reverse=True)
-
-
-def render_comparison(task: TaskSpec, runs: Sequence[ReportedRun]) -> Iterable[str]:
-    """Yield the sentences that compare runs of a task."""
-    yield f"<h1>{escape(task.name)}: {len(runs)} runs</h1>"
-    headline, *findings = compare_runs(runs) or [Finding("not_comparable")]
-    yield f'<p class="headline">{render(headline, MESSAGES, "html")}</p>'
-    if findings:
-        yield f'<p class="verdict">{" ".join(render(finding, MESSAGES, "html") for finding in findings)}</p>'
 
 
 def render_final_values(runs: Sequence[ReportedRun]) -> str:
@@ -223,11 +161,6 @@ def render_learning_curves(
         for metric in _other_metrics(task)
         if (chart := _draw_metric(metric, runs, colours, warmup, label_gap=9.0))
     }
-    if task.name in REFERENCE_RETURNS:
-        published = format_number(REFERENCE_RETURNS[task.name].trained)
-        yield render_note(
-            f"For comparison: TD3 on true rewards reaches about {published} within a million steps, as published."
-        )
     yield render_fold("More curves", [render_figures(charts)])
 
 

@@ -6,14 +6,11 @@ from contextlib import suppress
 from html import escape
 from pathlib import Path
 
-from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.evaluation.evaluate import measure_random_returns, n_random_episodes
-from lare_rl.evaluation.played_episodes import PlayedEpisodes, play_run
 from lare_rl.evaluation.video import encode_film, record_frames
 from lare_rl.report.html import render_film, render_fold, render_note, write_page
 from lare_rl.report.overview import (
-    render_comparison,
     render_final_values,
     render_headline,
     render_learning_curves,
@@ -122,27 +119,20 @@ def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
     n_random = max(n_random_episodes(reported.last_step, reported.run.config.longest_episode) for reported in runs)
     random_returns = measure_random_returns(task, n_random)
     summaries = summarise_runs(runs, random_returns)
-    loadable = [i for i, reported in enumerate(runs) if _can_load(reported.run)]
-    has_many_agents = bool(loadable) and load_env_spec(task).n_agents > 1
-    episodes, errors = {}, {}
-    for i in loadable if has_many_agents else ():
-        try:
-            episodes[i] = play_run(runs[i].run)
-        except LareError as error:
-            errors[i] = error
-    filmed = loadable[:MAX_FILMS] if film else []
-    films = {i: _load_film(runs[i].run, episodes.get(i), FILM_BYTES // len(filmed)) for i in filmed}
+    filmed = [i for i, reported in enumerate(runs) if _can_load(reported.run)][:MAX_FILMS] if film else []
+    films = {i: _load_film(runs[i].run, FILM_BYTES // len(filmed)) for i in filmed}
     figures = {i: render_film(data, f"An episode of {runs[i].name}") for i, data in films.items() if data}
     if len(runs) == 1:
         yield from render_verdict(runs[0], summaries[0], figures.get(0, ""))
         yield render_note(describe_method(runs[0].run))
         yield "<h2>Learning</h2>"
         yield from render_learning_curves(task, runs, random_returns)
-        yield from _render_details(runs[0].run, summaries[0], episodes.get(0), errors.get(0))
+        yield from _render_details(runs[0].run, summaries[0])
         yield _note_missing(runs)
         yield render_fold("Final values of each seed", [render_final_values(runs)])
         return
-    yield from render_comparison(task, runs)
+    yield f"<h1>{escape(task.name)}: {len(runs)} runs</h1>"
+    yield render_note("To rank methods, with intervals and p-values: lare-rl compare.")
     if figures:
         yield '<div class="films">'
         for i, figure in figures.items():
@@ -151,25 +141,21 @@ def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
     yield from render_learning_curves(task, runs, random_returns)
     yield render_final_values(runs)
     yield "<h2>Each run</h2>"
-    for i, (reported, summary) in enumerate(zip(runs, summaries, strict=True)):
-        details = _render_details(reported.run, summary, episodes.get(i), errors.get(i))
+    for reported, summary in zip(runs, summaries, strict=True):
+        details = _render_details(reported.run, summary)
         title = f"{reported.name}: {render_headline(summary)}" if summary else reported.name
         verdict = render_verdict(reported, summary, has_title=False)
         yield render_fold(title, [*verdict, render_note(describe_method(reported.run)), *details])
     yield _note_missing(runs)
 
 
-def _render_details(
-    run: Run, summary: RunSummary | None, played: PlayedEpisodes | None, error: LareError | None
-) -> list[str]:
+def _render_details(run: Run, summary: RunSummary | None) -> list[str]:
     """Return what a run's checkpoint and files show. If they cannot be used, say why: the rest of the report does not need them."""
     trust = list(render_trust(summary))
     try:
-        if error is None:
-            return list(render_details(run, trust, played))
-    except LareError as details_error:
-        error = details_error
-    return [*trust, render_note(f"There are no credit and factors to show: {error}.")]
+        return list(render_details(run, trust))
+    except LareError as error:
+        return [*trust, render_note(f"There are no credit and factors to show: {error}.")]
 
 
 def _note_missing(runs: Sequence[ReportedRun]) -> str:
@@ -185,13 +171,13 @@ def _can_load(run: Run) -> bool:
     return run.has_checkpoint() and untrusted_module(run.config.task) is None
 
 
-def _load_film(run: Run, played: PlayedEpisodes | None, max_bytes: int) -> bytes | None:
+def _load_film(run: Run, max_bytes: int) -> bytes | None:
     """Return the film in the run's directory, or make one if it is older than the checkpoint. None if nothing can be drawn here."""
     path, written = run.directory / FILM, (run.checkpoint / STATE_FILE).stat().st_mtime
     if path.is_file() and path.stat().st_size <= max_bytes and path.stat().st_mtime >= written:
         return path.read_bytes()
     try:
-        film = encode_film(*record_frames(run, max_frames=MAX_FRAMES, played=played), max_bytes)
+        film = encode_film(*record_frames(run, max_frames=MAX_FRAMES), max_bytes)
     except LareError:
         return None
     with suppress(LareError):

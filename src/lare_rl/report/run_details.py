@@ -14,24 +14,21 @@ from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.credit import explanation_text
 from lare_rl.credit.methods import METHODS
 from lare_rl.envs.placement import load_env_spec
-from lare_rl.errors import LareError, install_command
+from lare_rl.errors import LareError
 from lare_rl.evaluation.episode_credit import EpisodeCredit, FactorLabel, label_factors, load_episode_credit
-from lare_rl.evaluation.played_episodes import PlayedEpisodes, TeamSample, sample_steps
 from lare_rl.latent.saved import read_source
-from lare_rl.report.charts import Bar, Chart, Line, draw_bars, draw_legend, draw_points, draw_strips, visible_steps
+from lare_rl.report.charts import Bar, Chart, Line, draw_bars, draw_legend, draw_strips, visible_steps
 from lare_rl.report.html import render_figures, render_fold, render_function, render_note, render_table
 from lare_rl.report.messages import WORDS
-from lare_rl.report.reported_run import ReportedRun, finite
+from lare_rl.report.reported_run import ReportedRun
 from lare_rl.runs.directory import Run, function_paths
 from lare_rl.tasks.spec import base_name
 from lare_rl.tasks.trust import TRUST_VARIABLE, untrusted_module
 from lare_rl.training.explain import explanation_source, find_explanations
 from lare_rl.util.findings import Finding, format_number, render
-from lare_rl.util.statistics import FLOAT32_NOISE, column_correlations
 
 __all__ = ["describe_method", "render_details", "render_settings"]
 
-TSNE_PERPLEXITY, MAX_TSNE_POINTS = 30, 1000
 MIN_BAND = 0.04
 """A band is visible if it is wider than this fraction of the range of the line."""
 _BAND_NOTE = (
@@ -48,23 +45,19 @@ _BAR_STYLES = {"plus": "the reward of a step rises with the factor", "minus": "i
 """The meanings of the colours of bars."""
 
 
-def render_details(run: Run, trust: Iterable[str] = (), played: PlayedEpisodes | None = None) -> Iterable[str]:
+def render_details(run: Run, trust: Sequence[str] = ()) -> Iterable[str]:
     """Yield what a run's checkpoint and files show.
 
     Args:
         trust: paragraphs on the quality of the credit, which stand above its picture.
-        played: an episode, for a run of many agents.
     """
-    trust = list(trust)
     if module := untrusted_module(run.config.task):
         yield from trust
         yield from _render_untrusted(run, module)
     elif not run.has_checkpoint():
         yield from trust
-    elif played is None:
-        yield from _render_single_agent(run, trust)
     else:
-        yield from _render_agents(run, played, trust)
+        yield from _render_checkpoint(run, trust)
 
 
 def _render_untrusted(run: Run, module: str) -> Iterable[str]:
@@ -79,22 +72,38 @@ def _render_untrusted(run: Run, module: str) -> Iterable[str]:
         yield render_fold(f"The latent function{f' of {role.team}' if role.team else ''}", [source])
 
 
-def _render_single_agent(run: Run, trust: Sequence[str]) -> Iterable[str]:
-    credit, labels = load_episode_credit(run), label_factors(run)
-    correlations = np.full(len(labels), np.nan) if credit is None else credit.correlations
-    yield from _render_earnings(run, [correlations])
-    yield from trust if credit is None else _render_credit(credit, labels, trust)
-    if run.function is not None:
-        yield render_fold("The latent function phi", [render_function(run.function)])
+def _render_checkpoint(run: Run, trust: Sequence[str]) -> Iterable[str]:
+    """Yield what earned the score, the credit of an episode, and the latent functions."""
+    credit, roles = load_episode_credit(run), run.config.task.roles
+    yield from _render_earnings(run, credit)
+    yield from trust if credit is None else _render_credit(credit, label_factors(run), trust)
+    for role, function in zip(roles, run.functions, strict=False):
+        title = f"The latent function phi{f' of {role.name}' if len(roles) > 1 else ''}"
+        yield render_fold(title, [render_function(function)])
 
 
 def _render_credit(credit: EpisodeCredit, labels: Sequence[FactorLabel], trust: Sequence[str]) -> Iterable[str]:
-    """Yield the credit of each step of a single agent's episode, and the factors of the steps."""
-    reward, proxy = credit.reward[:, 0], credit.proxy_reward[:, 0]
-    rows = {"True reward": reward[:, None]} if credit.has_step_rewards else {}
+    """Yield the credit of each step of an episode: of each agent or, of a single agent, also as lines, with its factors."""
+    has_many_agents = credit.reward.shape[1] > 1
+    rows = {"True reward": credit.reward} if credit.has_step_rewards else {}
     yield _render_heading("Credit over one episode", "proxy")
     yield from trust
-    yield draw_strips(rows | {"Proxy reward": proxy[:, None]}, shared_scale=True)
+    yield draw_strips(rows | {"Proxy reward": credit.proxy_reward}, shared_scale=not has_many_agents)
+    note = (
+        f"The last training episode of the first seed, {len(credit.reward):,} steps, exploration included, judged by the newest "
+        f"decoder. The sum of the true rewards is {format_number(credit.reward.sum())}, that of the proxy rewards "
+        f"{format_number(credit.proxy_reward.sum())}."
+    )
+    if has_many_agents:
+        scales = "A decoder is fitted to sums, so each picture has its own scale."
+        yield render_note(f"{note} Every agent is a row. {scales}")
+    else:
+        yield from _render_lines(credit, labels, note)
+
+
+def _render_lines(credit: EpisodeCredit, labels: Sequence[FactorLabel], note: str) -> Iterable[str]:
+    """Yield the rewards of a single agent, and the factors, as lines over the steps of an episode."""
+    reward, proxy = credit.reward[:, 0], credit.proxy_reward[:, 0]
     steps = visible_steps(len(reward))
     x = np.arange(steps.start, steps.stop, dtype=float)
     lines = [Line(x, reward[steps], "grey", label="true reward")] if credit.has_step_rewards else []
@@ -106,9 +115,7 @@ def _render_credit(credit: EpisodeCredit, labels: Sequence[FactorLabel], trust: 
     text = "Rewards over the steps of an episode"
     yield Chart(lines=lines, description=text, x_label="step of the episode").render()
     yield render_note(
-        f"The last training episode of the first seed, {len(reward):,} steps, exploration included, judged by the newest "
-        f"decoder. The lines show steps {steps.start} to {steps.stop - 1}. Return {format_number(reward.sum())}, sum of the proxy "
-        f"rewards {format_number(proxy.sum())}.{'' if band is None else _BAND_NOTE}"
+        f"{note} The lines show steps {steps.start} to {steps.stop - 1}.{'' if band is None else _BAND_NOTE}"
     )
     if labels:
         yield render_fold("The factors over the same steps", [_draw_factors(credit.factors[steps, 0], x, labels)])
@@ -131,7 +138,7 @@ def _draw_factors(
     return render_figures(charts)
 
 
-def _render_earnings(run: Run, correlations: Sequence[Float[np.ndarray, " factors"]]) -> Iterable[str]:
+def _render_earnings(run: Run, credit: EpisodeCredit | None) -> Iterable[str]:
     """Yield what earned the score of each team: findings about its returns, and the numbers of its factors."""
     explanations, roles = find_explanations(run), run.config.task.roles
     if any(explanations):
@@ -147,7 +154,8 @@ def _render_earnings(run: Run, correlations: Sequence[Float[np.ndarray, " factor
         if len(roles) > 1 and (findings or labels):
             yield f"<h3>{escape(role.name)}</h3>"
         yield from _render_findings(findings, labels)
-        table = _render_factor_table(findings, labels, correlations[team_index], run)
+        correlations = np.full(len(labels), np.nan) if credit is None else credit.correlations[team_index]
+        table = _render_factor_table(findings, labels, correlations, run)
         yield render_fold("The numbers of the factors", table)
 
 
@@ -232,62 +240,6 @@ def _format_factor(values: Mapping[str, Any]) -> tuple[str, str, str]:
     effect = render(values["effect"], explanation_text.MESSAGES) + _format_shape(values)
     per_unit = values.get("per_unit")
     return f"{values['share']:z.0%}", effect, "" if per_unit is None else f"{per_unit:+.3g}"
-
-
-def _render_agents(run: Run, played: PlayedEpisodes, trust: Sequence[str]) -> Iterable[str]:
-    """Yield what earned the score of each team, the credit of each agent and step, and the factors."""
-    roles, samples = run.config.task.roles, sample_steps(run) if run.functions else []
-    yield from _render_earnings(run, [sample.correlations for sample in samples] or [np.zeros(0)] * len(roles))
-    reward, proxy = played.select_episode((played.reward, played.proxy_reward))
-    sums = f"Sum of the true rewards {format_number(reward.sum())}"
-    if proxy is not None:
-        sums += f", of the proxy rewards {format_number(proxy.sum())}"
-    yield _render_heading("Who got which credit when", "proxy")
-    yield from trust
-    yield draw_strips({"True reward": reward} | ({} if proxy is None else {"Proxy reward": proxy}), shared_scale=False)
-    yield render_note(
-        f"One episode of the first seed's policy, from left to right; every agent is a row. {sums}. A decoder is fitted to sums, so "
-        "each picture has its own scale."
-    )
-    for role, sample, function in zip(roles, samples, run.functions, strict=False):
-        pictures = [_render_correlations(sample), *_render_tsne(sample)] if sample.has_step_rewards else []
-        sections = [*pictures, render_function(function)]
-        yield render_fold(f"The latent function of {role.name}", sections)
-
-
-def _render_correlations(sample: TeamSample) -> str:
-    """Return a note on how observations and factors correlate with the true reward. Empty if one of the three never varies."""
-    raw = finite(column_correlations(sample.next_observation, sample.reward))
-    latent = finite(sample.correlations)
-    if not len(raw) or not len(latent):
-        return ""
-    return render_note(
-        f"Absolute correlation with the true reward, mean over dimensions: {np.abs(raw).mean():.2f} for the "
-        f"{sample.next_observation.shape[1]} entries of an observation, {np.abs(latent).mean():.2f} for the "
-        f"{sample.factors.shape[1]} factors."
-    )
-
-
-def _render_tsne(sample: TeamSample) -> Iterable[str]:
-    """Yield t-SNE pictures of observations and of factors, coloured by the true reward (the paper's appendix G)."""
-    try:
-        from sklearn.manifold import TSNE
-    except ImportError:
-        yield render_note(f"A t-SNE picture of observations and factors is drawn here after {install_command('tsne')}.")
-        return
-    chosen = np.random.default_rng(0).permutation(len(sample.reward))[:MAX_TSNE_POINTS]
-    if len(chosen) <= TSNE_PERPLEXITY:
-        return
-    yield '<div class="figures">'
-    for name, columns in {"observations": sample.next_observation, "factors": sample.factors}.items():
-        rows = columns[chosen]
-        varies = rows.std(axis=0) > FLOAT32_NOISE * np.abs(rows).max(axis=0)
-        if varies.sum() < 2:  # the initial points are two principal components; scikit-learn crashes if nothing varies
-            continue
-        rows = (rows[:, varies] - rows[:, varies].mean(axis=0)) / rows[:, varies].std(axis=0)
-        points = TSNE(perplexity=TSNE_PERPLEXITY, init="pca", random_state=0).fit_transform(rows)
-        yield draw_points(points, sample.reward[chosen], f"t-SNE of the {name} of agents. Bright: a high true reward.")
-    yield "</div>"
 
 
 def render_settings(runs: Sequence[ReportedRun]) -> Iterable[str]:

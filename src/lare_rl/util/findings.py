@@ -22,7 +22,6 @@ __all__ = ["Finding", "format_for_reader", "format_number", "render"]
 Catalogue = Mapping[str, str]
 
 _CODE = re.compile(r"`([^`]*)`")
-_MARKDOWN_SPECIAL = re.compile(r"([\\*_|<>\[\]])")
 
 
 @dataclass(frozen=True)
@@ -37,20 +36,13 @@ class Finding:
         return hash((self.code, frozenset(self.values.items())))
 
 
-def render(finding: Finding, catalogue: Catalogue, style: Literal["text", "html", "markdown"] = "text") -> str:
-    """Return a finding's sentence for the terminal (`text`), a page (`html`, escaped), or a Markdown file (`markdown`, escaped).
+def render(finding: Finding, catalogue: Catalogue, style: Literal["text", "html"] = "text") -> str:
+    """Return a finding's sentence for the terminal (`text`) or a page (`html`, escaped).
 
     Raises `KeyError` if the catalogue lacks the code, or the finding a value of its template.
     """
     text = _Formatter(catalogue).vformat(catalogue[finding.code], (), finding.values)
-    if style == "html":
-        return _CODE.sub(r"<code>\1</code>", escape(text))
-    if style == "markdown":
-        return "".join(
-            f"`{piece}`" if number % 2 else _MARKDOWN_SPECIAL.sub(r"\\\1", piece)
-            for number, piece in enumerate(_CODE.split(text))
-        )
-    return text
+    return _CODE.sub(r"<code>\1</code>", escape(text)) if style == "html" else text
 
 
 def format_for_reader(value: Any, spec: str = "") -> str:
