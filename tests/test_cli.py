@@ -1,10 +1,7 @@
-import errno
-import os
 import re
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -13,7 +10,7 @@ from helpers.scripted_model import to_reply
 from helpers.toy_envs import PHI
 from lare_rl import cli
 from lare_rl.algorithms.registry import ALGORITHMS
-from lare_rl.cli.terminal import EpisodeProgress, print_progress
+from lare_rl.cli.terminal import print_progress
 from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import read_task, shipped_tasks
 from lare_rl.llm.prompts import candidate
@@ -115,34 +112,11 @@ for arguments in ["train", {path!r}], ["verify", "phi.py", "--task", {path!r}]:
     assert process.stdout == "[]\n[]\n"
 
 
-def test_progress_of_episodes(monkeypatch, capsys):
-    """After the first episode that takes long, then every 20 seconds, and not when it is nearly over."""
-    now = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    report = EpisodeProgress(20)
-    for n_done in range(1, 21):
-        now[0] += 9.0
-        report(n_done)
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[:2] == ["played 1 of 20 episodes, 3 min left", "played 4 of 20 episodes, 3 min left"]
-    assert len(lines) == 7
-    EpisodeProgress(20)(20)
-    assert capsys.readouterr().err == ""
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no disk that is always full")
 def test_progress_on_a_full_disk(monkeypatch):
     with open("/dev/full", "w", buffering=1) as full:
         monkeypatch.setattr(sys, "stderr", full)
         print_progress("half done")
-
-
-def test_closed_streams(monkeypatch):
-    for name, value in (("stdout", None), ("stderr", None), ("argv", ["lare-rl", "tasks"])):
-        monkeypatch.setattr(sys, name, value)
-    cli.main()
-    with sys.stdout, sys.stderr:
-        pass
 
 
 def test_tasks(command):
@@ -163,14 +137,7 @@ def test_prompt(command, kind):
     assert command("prompt", "Reacher-v4", "--kind", kind) == (0, text, "")
 
 
-def test_new_task(command, tmp_path, monkeypatch):
-    def fail(file):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", fail)
-        assert "No space left" in command("new-task", "Pendulum-v1")[2]
-    assert list(tmp_path.iterdir()) == []
+def test_new_task(command, tmp_path):
     status, out, err = command("new-task", "Pendulum-v1")
     assert (status, err) == (0, "")
     assert out.splitlines()[0] == "wrote Pendulum-v1.toml"

@@ -60,19 +60,10 @@ def test_example_of_a_library(name, library, arguments):
 def test_optuna_study(tmp_path):
     path = EXAMPLES / "optuna_study.py"
     compile(path.read_text(encoding="utf-8"), path.name, "exec")
-    optuna = pytest.importorskip("optuna")
+    pytest.importorskip("optuna")
     example = runpy.run_path(str(path))
     small = {"evaluate_every": 50, "evaluation_episodes": 1, "method": "rd-linear"}
     study = example["main"](n_trials=1, steps=100, warmup=50, out=str(tmp_path), **small)
     (trial,), run = study.trials, lare_rl.open_run(tmp_path / "0")
     assert trial.intermediate_values == {line["step"]: line["evaluation/return"] for line in run.metrics()}
     assert run.config.settings.hyperparameters.tau == trial.params["tau"]
-    study.enqueue_trial({"gamma": 0.95, "tau": 0.01})
-
-    def prune(trial):
-        report = example["Report"](trial)
-        report.on_evaluation([{"step": step, "evaluation/return": -1e9} for step in (50, 100)])
-
-    study.pruner = optuna.pruners.MedianPruner(n_startup_trials=0)
-    study.optimize(prune, 1)
-    assert study.trials[-1].state == optuna.trial.TrialState.PRUNED

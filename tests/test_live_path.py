@@ -1,5 +1,6 @@
 """From a live model to a trained policy: a server on loopback gives the recorded replies."""
 
+import errno
 import itertools
 import subprocess
 import sys
@@ -17,7 +18,8 @@ from lare_rl.errors import LareError
 from lare_rl.latent.design import design
 from lare_rl.latent.saved import load_function
 from lare_rl.llm.recording import read_recording, shipped_recordings
-from lare_rl.util import files
+
+REACHER_PHI = "def evaluation_func(o, a):\n    return [np.sum(a**2, axis=1, keepdims=True), o[:, 8:9]]"
 
 KEY = "sk-a-key-that-nobody-may-see"
 
@@ -108,7 +110,7 @@ def test_live_model_to_trained_policy(serve, command, design_live, tmp_path):
         ),
     ],
 )
-def test_attempts_are_saved(serve, design_live, tmp_path, text, options, status, words, n_replies):
+def test_replies_are_saved(serve, design_live, tmp_path, text, options, status, words, n_replies):
     """In the file of --record, or in a new one."""
     (tmp_path / "Reacher-v4.attempts.json").touch()
     result, out, err = design_live(serve(reply_with(text)), "--candidates", 1, *options)
@@ -117,7 +119,7 @@ def test_attempts_are_saved(serve, design_live, tmp_path, text, options, status,
     assert all(word in line for word in words)
     assert "\x1b" not in err
     name = "talk.json" if "--record" in options else "Reacher-v4.attempts-2.json"
-    assert f"every attempt is kept in {name}" in err
+    assert ("every reply is kept in" in err) == ("--record" not in options)
     assert saved_stages(tmp_path / name) == ["candidate", *["correct"] * (n_replies - 1)]
 
 
@@ -139,40 +141,35 @@ def test_files_are_checked_before_a_model_is_asked(command, tmp_path, arguments,
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="no directory in which nobody can write")
-def test_function_is_printed_if_it_cannot_be_written(command, tmp_path, monkeypatch):
-    monkeypatch.setattr(files, "check_writable", lambda path: None)  # as if the error came after the check
-    status, out, err = command("design", "Reacher-v4", "--out", "/proc/phi.py")
-    assert status == 2
-    assert "/proc/phi.json cannot be written" in err.splitlines()[-1]
-    assert "def evaluation_func" in out
-    status, _, err = command("design", "Reacher-v4", "--record", "/proc/talk.json")
-    assert status == 2
-    assert err.splitlines()[-1] == "every attempt is kept in Reacher-v4.attempts.json"
-    assert read_recording((tmp_path / "Reacher-v4.attempts.json").read_text(), "attempts").exchanges
+def test_folder_that_cannot_be_written(serve, design_live, monkeypatch):
+    """The replies could not be kept, so none is asked for."""
+    server = serve(recorded_answers)
+    monkeypatch.chdir("/proc")
+    status, out, err = design_live(server)
+    assert (status, out, err.count("\n"), server.requests) == (2, "", 1, [])
+    assert "Reacher-v4.attempts.json cannot be written" in err
 
 
-RUN_LARE = """
-import sys
-from lare_rl.cli import main
-for command in sys.argv[1:]:
-    sys.argv = ["lare-rl", *command.split()]
-    try:
-        main()
-    except SystemExit as exit_:
-        print("status", exit_.code, file=sys.stderr)
-"""
+@pytest.mark.parametrize(("is_full", "n_files"), [(True, 1), (False, 0)])
+def test_replies_stay_if_the_function_cannot_be_printed(is_full, n_files, serve, design_live, tmp_path, monkeypatch):
+    def fail(text):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    if is_full:
+        monkeypatch.setattr(sys.modules["lare_rl.cli.design"], "print_line", fail)
+    status, out, err = design_live(serve(reply_with(to_reply(REACHER_PHI))), "--candidates", 1)
+    assert (status, out) == ((2, "") if is_full else (0, REACHER_PHI + "\n"))
+    assert ("No space left on device" in err) == is_full
+    assert len(list(tmp_path.glob("*.attempts.json"))) == n_files
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no disk that is always full")
-def test_function_is_saved_if_it_cannot_be_printed(tmp_path):
+def test_full_disk():
     with open("/dev/full", "w") as full:
-        commands = [sys.executable, "-c", RUN_LARE, "design Reacher-v4", "prompt Reacher-v4"]
-        process = subprocess.run(commands, cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True)
-    *_, design_error, design_status, prompt_error, prompt_status = process.stderr.splitlines()
-    assert "kept in Reacher-v4.py" in design_error
-    assert "No space left on device" in prompt_error
-    assert design_status == prompt_status == "status 2"
-    assert load_function(tmp_path / "Reacher-v4.py", read_task("Reacher-v4")).size > 0
+        command = [sys.executable, "-m", "lare_rl", "prompt", "Reacher-v4"]
+        process = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert process.returncode == 2
+    assert process.stderr == "lare-rl: [Errno 28] No space left on device\n"
 
 
 REPLIES = st.one_of(

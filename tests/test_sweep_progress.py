@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from helpers.toy_envs import toy_spec
-from lare_rl.cli.sweep_progress import show_progress, update_bars
+from lare_rl.cli.sweep_progress import update_bars
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
 from lare_rl.sweep.jobs import Job
@@ -43,9 +43,3 @@ def test_update_bars(tmp_path):
         ("Chase/b", 50, 100, True),
         ("Chase/c", 100, 100, False),
     ]
-
-
-def test_messages_without_a_terminal(capsys):
-    with show_progress([]) as print_message:
-        print_message("1 of 1: done")
-    assert capsys.readouterr().err == "1 of 1: done\n"

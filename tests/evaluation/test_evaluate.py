@@ -10,8 +10,8 @@ from PIL import Image
 
 import lare_rl
 from helpers.toy_envs import Chase, levels_spec, pick_spec, toy_spec
-from lare_rl.config.resolve import resolve
-from lare_rl.envs.placement import load_env_spec, make_host_env
+from helpers.untrained_runs import untrained_run
+from lare_rl.envs.placement import make_host_env
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.errors import LareError, check_count, install_command
 from lare_rl.evaluation import evaluate as module
@@ -25,18 +25,13 @@ from lare_rl.evaluation.evaluate import (
     evaluation_seeds,
     gain_over_random,
     measure_random_returns,
-    n_random_episodes,
     play_random,
 )
 from lare_rl.evaluation.video import check_video_path, record_video, write_video
-from lare_rl.report.evaluation_lines import compare_actions, describe_evaluation
-from lare_rl.runs.config_file import make_config
-from lare_rl.runs.directory import Run, create_run
+from lare_rl.report.evaluation_lines import describe_evaluation
 from lare_rl.runs.metric_names import DETERMINISTIC_RETURN
-from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_learner
-from lare_rl.training.session import start_session
 from lare_rl.training.unroll_host import evaluate_batch_on_host, evaluation_policy
 from lare_rl.util.statistics import format_mean_std
 
@@ -146,14 +141,6 @@ def test_random_play_is_bounded(monkeypatch):
     assert play_random(TASK) == [[]]
 
 
-@pytest.mark.parametrize(
-    ("run_steps", "longest", "n_episodes"), [(50_000, 120, 50), (12_240, 120, 25), (1_000, 1_000, 10), (0, 5, 10)]
-)
-def test_number_of_random_episodes(run_steps, longest, n_episodes):
-    """It follows from numbers of steps, not from a stopwatch."""
-    assert n_random_episodes(run_steps, longest) == n_episodes
-
-
 @pytest.mark.long
 def test_most_likely_actions_beside_sampled_ones(small, tmp_path, command):
     """Of a policy over choices: at the last evaluation, and by `lare-rl evaluate`, with the difference from random actions."""
@@ -185,14 +172,12 @@ def test_measures_of_random_play(run, command):
 def test_random_actions_play_the_same_groups(small, tmp_path, command):
     """Otherwise a sentence says so. The mean of the numbers of the groups is not reported."""
     task = levels_spec(payments=2)
-    session = start_session(create_run(tmp_path / "run", task, resolve(small(method="dense", capacity=64), task), ()))
-    session.save()
-    session.close()
-    status, out, err = command("evaluate", session.run.directory, "--episodes", 3)
+    run = untrained_run(task, small(method="dense", capacity=64), tmp_path / "run")
+    status, out, err = command("evaluate", run.directory, "--episodes", 3)
     assert (status, err) == (0, "")
     assert "over 12 episodes" in out
     assert "level" not in out
-    by_turns = replace_task(session.run, levels_spec(environment="toys/LevelsByTurns-v0", payments=2))
+    by_turns = replace_task(run, levels_spec(environment="toys/LevelsByTurns-v0", payments=2))
     lines = list(
         describe_evaluation(by_turns, evaluate_policy(by_turns, 3), play_random(by_turns.config.task, 3), None)
     )
@@ -207,27 +192,6 @@ def test_evaluate_in_another_environment(run, command):
     for name in ("toys/Missing-v0", "other:Chase-v0"):
         with pytest.raises(LareError, match=name):
             evaluate_run(run, environment=name)
-
-
-def test_another_environment_of_several_teams(tmp_path):
-    names = "pettingzoo/helpers.parallel_toy_envs:Capitals", "pettingzoo/helpers.parallel_toy_envs:OtherCapitals"
-    sizes = {"environment": names[0], "observation_size": 2, "action_size": 3}
-    teams = tuple(toy_spec(name=team, team=team, agents=(f"{team}_*",), **sizes) for team in ("Hunter", "Prey"))
-    task = toy_spec(teams=teams, **sizes)
-    run = Run(tmp_path, make_config(task, resolve(lare_rl.Settings(method="dense"), task), ()), ())
-    moved = module.move_evaluations(run, names[1]).config.task
-    assert {role.evaluation_environment for role in (moved, *moved.teams)} == {names[1]}
-    assert [team.name for team in load_env_spec(moved).teams] == ["Hunter", "Prey"]
-
-
-@pytest.mark.parametrize(("gain", "text"), [(1.0, "better"), (-1.0, "worse"), (0.0, None)])
-def test_the_better_actions_are_named(run, gain, text):
-    noise = np.random.default_rng(0).normal(size=(2, 3, 1))
-    sampled = Evaluation(np.zeros_like(noise), noise, np.ones((2, 3), int), {})
-    likeliest = sampled._replace(returns=100 * gain + noise - noise.mean())
-    lines = list(compare_actions(run, sampled, likeliest))
-    assert len(lines) == (text is not None)
-    assert all(text in line for line in lines)
 
 
 def test_evaluate_in_several_batches(run, returns):

@@ -11,14 +11,12 @@ import lare_rl
 from helpers.jax_toy_envs import Echo, echo_spec
 from helpers.numpy_twins import assert_close
 from helpers.small_configs import SMALL_SETTINGS, add_steps, random_steps
-from lare_rl.config.resolve import resolve
+from helpers.untrained_runs import untrained_run
 from lare_rl.errors import LareError
 from lare_rl.evaluation import played_episodes as module
 from lare_rl.evaluation.played_episodes import compute_proxy_rewards, play_run, sample_steps, unroll_policy
-from lare_rl.runs.directory import create_run
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
-from lare_rl.training.train import start_session
 
 pytestmark = pytest.mark.long
 
@@ -39,10 +37,7 @@ def run(tmp_path_factory):
         credit={"exact": "last", "score": "sum"},
         ippo={"hidden": (8,), "minibatch_size": 60, "epochs": 1},
     )
-    session = start_session(create_run(tmp_path_factory.mktemp("runs") / "echo", TASK, resolve(settings, TASK), ()))
-    session.save()
-    session.close()
-    return session.run
+    return untrained_run(TASK, settings, tmp_path_factory.mktemp("runs") / "echo")
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -86,16 +81,14 @@ def test_actor_is_that_of_the_checkpoint(tmp_path, monkeypatch):
     settings = lare_rl.Settings(
         method="ircr", algorithm="qmix", steps=120, rollout_steps=60, environments=2, qmix=SMALL_SETTINGS["qmix"]
     )
-    session = start_session(create_run(tmp_path / "qmix", TASK, resolve(settings, TASK), ()))
-    session.save()
-    session.close()
+    run = untrained_run(TASK, settings, tmp_path / "qmix")
 
     def unroll(run, config, actor, n_episodes):
         raise LareError(f"epsilon {float(actor.epsilon[0])}")
 
     monkeypatch.setattr(module, "_unroll_on_host", unroll)
     with pytest.raises(LareError, match=r"epsilon 1\.0"):
-        play_run(session.run)
+        play_run(run)
 
 
 def test_exact_rewards_add_up_to_payments(run, played):

@@ -87,7 +87,3 @@ class Capitals(Toy):
 
     def __init__(self, **more):
         super().__init__(("Hunter_0", "Prey_0"), **more)
-
-
-class OtherCapitals(Capitals):
-    """The same in which policies are evaluated."""

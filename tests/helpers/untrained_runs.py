@@ -1,4 +1,4 @@
-"""Run directories without training."""
+"""Run directories without training, and runs that were not trained."""
 
 import json
 
@@ -6,6 +6,8 @@ from helpers.toy_envs import toy_spec
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
 from lare_rl.runs.config_file import make_config
+from lare_rl.runs.directory import create_run
+from lare_rl.training.session import start_session
 
 LINE = {"step": 1, "seed": 0, "evaluation/return": 1.5}
 """An evaluation."""
@@ -23,13 +25,21 @@ def write_run(directory, task, settings, metrics, functions=()):
 def invent_training(find_metrics):
     """Return a function that writes metrics instead of training a job: those of a job and a seed, at two steps."""
 
-    def train(job, slot, running):
+    def train(job, *_):
         steps = (job.resolved.steps // 2, job.resolved.steps)
         seeds = job.resolved.all_seeds
         metrics = [{"step": step, "seed": seed, **find_metrics(job, seed)} for step in steps for seed in seeds]
         write_run(job.directory, job.task, job.resolved, metrics)
 
     return train
+
+
+def untrained_run(task, settings, directory):
+    """Return a run whose checkpoint is from before its first step: nothing of its training is compiled."""
+    session = start_session(create_run(directory, task, resolve(settings, task), ()))
+    session.save()
+    session.close()
+    return session.run
 
 
 def write_changed_run(directory, **changes):

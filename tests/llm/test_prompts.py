@@ -1,29 +1,33 @@
 """Requests to a model: the recorded ones can be built again, byte for byte."""
 
+from pathlib import Path
+
 import pytest
 
 from lare_rl.envs.load import read_task
 from lare_rl.llm.prompts import candidate, combine, correct
 from lare_rl.llm.recording import SHIPPED_RECORDINGS, read_recording
 
+REAL = Path(__file__).parents[2] / "benchmarks" / "real"
 DIALOGUE = [{"role": "system", "content": "You write code."}, {"role": "user", "content": "Write some."}]
 
 
 def test_recorded_requests():
-    kinds = [SHIPPED_RECORDINGS / kind for kind in ("factors", "reward")]
-    names = [f"{kind.name}/{entry.name}" for kind in kinds for entry in kind.iterdir()]
-    assert len(names) > 50
-    for name in names:
-        recording = read_recording((SHIPPED_RECORDINGS / name).read_text(encoding="utf-8"), name)
-        task = read_task(recording.task)
+    """Of the recordings that are shipped, and of those of the real simulators."""
+    shipped = [entry for kind in ("factors", "reward") for entry in (SHIPPED_RECORDINGS / kind).iterdir()]
+    real = list((REAL / "recordings").iterdir())
+    assert (len(shipped) > 50, len(real)) == (True, 10)
+    for entry in (*shipped, *real):
+        recording = read_recording(entry.read_text(encoding="utf-8"), entry.name)
+        assert entry.name == f"{recording.task}.draw{recording.draw}.json"
+        task = read_task(str(REAL / "tasks" / f"{recording.task.lower()}.toml") if entry in real else recording.task)
         first, second, *corrections = recording.exchanges
-        assert (first.stage, second.stage) == ("candidate", "combine"), name
-        assert {exchange.stage for exchange in corrections} <= {"correct"}, name
-        assert candidate(task, recording.kind) == first.messages, name
+        assert (first.stage, second.stage) == ("candidate", "combine"), entry.name
+        assert {exchange.stage for exchange in corrections} <= {"correct"}, entry.name
+        assert candidate(task, recording.kind) == first.messages, entry.name
         conversation = second.messages[2]["content"]  # only candidates that passed are combined
         combined = [reply for reply in first.replies if reply.strip() in conversation]
-        assert combine(task, combined, recording.kind) == second.messages, name
-        assert name == f"{recording.kind}/{recording.task}.draw{recording.draw}.json"
+        assert combine(task, combined, recording.kind) == second.messages, entry.name
 
 
 @pytest.mark.parametrize(

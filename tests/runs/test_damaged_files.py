@@ -40,10 +40,7 @@ def refusal(read, *arguments) -> str:
     [
         (b"", "line 1 column 1"),
         (DEEP.encode(), TOO_DEEP),
-        (b'{"format": ' + b"[" * 988 + b"]" * 988 + b"}", TOO_DEEP),
         (b"[]", "not an object"),
-        (b"\xff", "byte 0xff"),
-        (b'{"format": ' + b"9" * 5000 + b"}", "5,000 digits"),
         (f'{{"format": {FORMAT}}}'.encode(), "'lare', 'settings', 'task'"),
         (b'{"format": 1, "lare": "0.1"}', "another version of LaRe (0.1)"),
         (b'{"lare": "0.1"}', "no 'format'"),
@@ -85,7 +82,6 @@ def test_html_is_escaped(tmp_path):
     [
         (DEEP, TOO_DEEP),
         ("{", "line 2 is not valid JSON: Expecting"),
-        ("9" * 5000, "5,000 digits"),
         ("[]", "line 2 is no evaluation"),
         *((json.dumps(LINE | {"step": step}), "line 2 is no evaluation") for step in (True, -1, 1.5, 10**400)),
         *((json.dumps(LINE | {name: "0"}), "line 2 is no evaluation") for name in ("seed", "evaluation/return")),
@@ -183,12 +179,7 @@ def header(shape: tuple) -> bytes:
 
 
 @pytest.mark.parametrize(
-    "content",
-    [
-        *map(header, [(10**15,), (10**11,), (2**62, 4), (-1,)]),
-        header((3,)).replace(b"(3,), }" + b" " * 20, b"1" + b"+1" * 13),
-        header((3,))[:-1],
-    ],
+    "content", [header((10**15,)), header((3,)).replace(b"(3,), }" + b" " * 20, b"1" + b"+1" * 13)]
 )
 def test_state_with_false_header(directory, content):
     with zipfile.ZipFile(directory / "state.npz", "a") as archive:
@@ -215,12 +206,9 @@ def test_state_that_is_no_plain_archive(directory):
     ("content", "message"),
     [
         (f"x = {DEEP}", TOO_DEEP),
-        ("x = {" * 100 + "}" * 100, TOO_DEEP),
         ("x", "Expected '='"),
-        (f"x = {'9' * 5000}", "digits"),
         ("", "missing|required"),
         ("name = 3\ntasks = {}", "name|tasks"),
-        ("#" * (2 << 20), "is larger than 1 MB"),
     ],
 )
 def test_task_or_sweep(tmp_path, read, content, message):

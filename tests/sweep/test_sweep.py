@@ -19,7 +19,7 @@ from helpers import untrained_runs
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.sweep.jobs import describe_job, train_job
-from lare_rl.sweep.processes import RunningProcesses, train_in_process
+from lare_rl.sweep.processes import train_in_process
 from lare_rl.sweep.resources import Slot
 from lare_rl.sweep.sweep import read_sweep, run_sweep
 from lare_rl.training.train import RunInterruptedError
@@ -228,19 +228,19 @@ def test_error_of_process(file, tmp_path):
     """The path has a byte that is not UTF-8."""
     job = replace(read_sweep(file)[1][0], directory=tmp_path / "\udcff" / "dense-td3")
     job.directory.mkdir(parents=True)  # as if another sweep had just started it
-    error = train_in_process(job, Slot([], {}), RunningProcesses())
+    error = train_in_process(job, Slot([], {}), [], threading.Event())
     assert error.startswith(f"{tmp_path}/\\udcff/dense-td3 exists")
     assert error.endswith("dense-td3.log)")
-    running = RunningProcesses()
-    running.stop()
-    assert "not started" in train_in_process(job, Slot([], {}), running)
+    stopped = threading.Event()
+    stopped.set()
+    assert "not started" in train_in_process(job, Slot([], {}), [], stopped)
 
 
 @pytest.mark.parametrize(
     ("script", "error"),
     [
         ("exit 1", "exit status 1"),  # not the last line of an earlier process in the log
-        ("kill -9 $$", "it was ended by SIGKILL"),
+        ("kill -9 $$", "it was ended by signal SIGKILL"),
         ("exit 0", "it ended at step 0 of 200"),  # an environment that ends the process
         ("echo no space is left; exit 2", "no space is left"),  # the log of a full disk has no room for it
         ("echo last line >&2; echo >&2; exit 3", "last line"),
@@ -253,7 +253,7 @@ def test_end_of_process(file, python_script, script, error):
     log.parent.mkdir(parents=True)
     log.write_text("step 100 of 200: all is well\n")
     python_script(script)
-    assert train_in_process(job, Slot([], {}), RunningProcesses()) == f"{error} ({log})"
+    assert train_in_process(job, Slot([], {}), [], threading.Event()) == f"{error} ({log})"
 
 
 @pytest.mark.parametrize(

@@ -16,12 +16,6 @@ def test_check_new_path(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no directory in which nobody can write")
-def test_check_new_path_in_a_directory_in_which_nobody_can_write():
-    with pytest.raises(LareError, match="cannot be written"):
-        check_new_path(Path("/proc/x.html"))
-
-
 @pytest.mark.parametrize(
     ("error", "expected"),
     [(OSError(28, "No space left on device"), LareError), (KeyboardInterrupt(), KeyboardInterrupt)],

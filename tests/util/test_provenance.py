@@ -35,8 +35,3 @@ def test_code_version_within_another_repository(checkout):
     package = checkout / ".venv" / "lare"
     package.mkdir(parents=True)
     assert code_version(package) == lare_rl.__version__
-
-
-def test_code_version_without_git(checkout, monkeypatch):
-    monkeypatch.setenv("PATH", "")
-    assert code_version(checkout) == lare_rl.__version__

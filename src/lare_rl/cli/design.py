@@ -1,7 +1,6 @@
 """The command `design`: a latent function from recorded replies or from a live model."""
 
 import shlex
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,18 +16,14 @@ from lare_rl.cli.terminal import (
     Task,
     load_playing_policy,
     load_steps,
-    print_error,
     print_line,
     print_progress,
-    print_source,
 )
 from lare_rl.errors import LareError
 from lare_rl.llm.prompts import FunctionKind
 from lare_rl.util.files import check_new_path, find_free_path
 
 if TYPE_CHECKING:
-    from lare_rl.latent.design import DesignError
-    from lare_rl.latent.function import LatentFunction
     from lare_rl.llm.model import Model
     from lare_rl.tasks.spec import TaskSpec
 
@@ -51,7 +46,7 @@ def design(
 
     Prints the function, or writes it to a file that `lare-rl train --function` takes. A live model needs the extra
     lare-rl[llm]; its key comes from the environment variable OPENAI_API_KEY, and is never written down. A server of your own
-    that asks for no key, such as Ollama, needs none.
+    that asks for no key, such as Ollama, needs none. After an error, its replies are in TASK.attempts.json.
 
     Args:
         model_name: "recorded" (the shipped recordings, and the default), the path of a recording (.json), or the name of a model
@@ -80,33 +75,41 @@ def design(
     play, steps = load_playing_policy(policy, spec), load_steps(data, spec)
     path = None if model_name == RECORDED else Path(model_name)
     model = live.open(model_name) if is_live else recorded_model(spec.name, kind, draw, path)
-    outputs: dict[str, Any] = {"record": record, "on_message": print_progress}
     options: dict[str, Any] = {"candidates": candidates, "pre_verification": pre_verification, "steps": steps}
-    with after_requests(spec.name, model, live):
+    with record_replies(spec.name, model, live, record) as recording:
+        outputs: dict[str, Any] = {"record": recording, "on_message": print_progress}
         function = lare_rl.design(spec, kind, model, **options, **outputs)
         if reflect:
             function = lare_rl.reflect(function, spec, model, reflect, policy=play, **outputs)
-    if out is None:
-        print_source(function.source, function.save, find_free_path(Path(), spec.name, ".py"))
-    else:
-        _save_function(function, out, _next_command(task, spec, out, kind, data))
+        if out is None:
+            print_line(function.source)
+        else:
+            function.save(out)
+            print_line(f"wrote {out}: {function.size} factors ({', '.join(function.names)})")
+            print_line(_next_command(task, spec, out, kind, data))
 
 
 @contextmanager
-def after_requests(name: str, model: "Model", live: LiveOptions) -> Iterator[None]:
-    """Save the replies of a design that fails, as NAME.attempts.json, because they were paid for. Print what a live model has cost."""
-    from lare_rl.latent.design import DesignError
+def record_replies(name: str, model: "Model", live: LiveOptions, record: Path | None) -> Iterator[Path | None]:
+    """Yield the file in which replies are recorded. Print what a live model has cost.
+
+    Without `record`, it is NAME.attempts.json for a live model, whose replies are paid for. This file stays only after an error.
+    """
     from lare_rl.llm.live import LiveModel
 
+    if not isinstance(model, LiveModel):
+        yield record
+        return
+    path = record or find_free_path(Path(), f"{name}.attempts", ".json")
     try:
-        yield
-    except DesignError as error:
-        print_error(error)
-        _save_attempts(error, find_free_path(Path(), f"{name}.attempts", ".json"))
-        sys.exit(error.status)
+        yield path
+        if record is None:
+            path.unlink(missing_ok=True)
     finally:
-        if isinstance(model, LiveModel) and model.budget.requests_used:
+        if model.budget.requests_used:
             print_progress(f"{model.name}: {model.budget.summary(live.price)}")
+        if record is None and path.exists():
+            print_progress(f"every reply is kept in {path}")
 
 
 def _next_command(task: str, spec: "TaskSpec", out: Path, kind: FunctionKind, data: str | None) -> str:
@@ -156,29 +159,3 @@ def check_function_files(out: Path | None, record: Path | None = None) -> Path |
         if record.resolve() in [path.resolve() for path in files]:
             raise LareError(f"--out writes {record} too: choose another --record")
     return out
-
-
-def _save_attempts(error: "DesignError", new_path: Path) -> None:
-    """Save the replies, which were paid for, in the recorder's file or else in a new one. If both fail, print them."""
-    recorder = error.recorder
-    recorded = [recorder.path] if recorder.path and recorder.owns_file else []
-    for path in (*recorded, new_path):
-        try:
-            recorder.save(path, new=path == new_path)
-        except LareError as write_error:
-            print_error(write_error)
-        else:
-            print_progress(f"every attempt is kept in {path}")
-            return
-    print_line(recorder.to_json())
-
-
-def _save_function(function: "LatentFunction", out: Path, next_command: str) -> None:
-    """Save a function, and print what to do next. If that fails, print it, because the model's replies were paid for."""
-    try:
-        function.save(out)
-    except LareError:
-        print_line(function.source)
-        raise
-    print_line(f"wrote {out}: {function.size} factors ({', '.join(function.names)})")
-    print_line(next_command)

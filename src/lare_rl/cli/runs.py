@@ -35,7 +35,6 @@ def evaluate(
             that of the run's evaluations.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
-    _refuse_untrusted(run)
     from lare_rl.envs.placement import load_env_spec
     from lare_rl.evaluation.evaluate import move_evaluations
     from lare_rl.evaluation.video import check_video_path, record_video
@@ -57,20 +56,6 @@ def evaluate(
         print_line(f"Credit, judged on the stored training episodes of seed {opened.seeds[0]}:")
     for line in explanation:
         print_line(line)
-
-
-def _refuse_untrusted(directory: Path) -> None:
-    """Refuse a run of an untrusted module before the slow imports. A file that cannot be read is reported later, by `open_run`."""
-    from lare_rl.config.migrate import CONFIG, migrate
-    from lare_rl.tasks.spec import TaskSpec
-    from lare_rl.tasks.trust import check_trusted
-    from lare_rl.util.safe_io import read_table
-
-    try:
-        task = TaskSpec(**migrate(read_table(directory / CONFIG))["task"])
-    except (LareError, TypeError, KeyError):
-        return
-    check_trusted(task, directory)
 
 
 def _render_without_screen() -> None:
@@ -124,7 +109,6 @@ def export(
         seed: the seed whose policy and decoder are written; the default is the first.
         best: write the policy of the seed's best evaluation, instead of the last policy. Proxy rewards are always the last ones.
     """
-    _refuse_untrusted(run)
     import lare_rl
     from lare_rl.runs.directory import open_run
 

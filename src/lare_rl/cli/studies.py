@@ -156,7 +156,8 @@ def reproduce(
             n_failed += 1
             print_progress(f"{name}: {error}")
     if n_failed:
-        raise LareError(f"{n_failed} of {len(names)} exhibits have no page")
+        print_progress(f"{n_failed} of {len(names)} exhibits have no page")
+        sys.exit(1)
 
 
 def _import_from_checkout(module: str) -> ModuleType:

@@ -3,7 +3,7 @@
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TextIO
 
@@ -76,17 +76,6 @@ DEFAULT_LIVE = LiveOptions()
 def print_line(text: str) -> None:
     """Print a text to standard output, without characters that control the terminal."""
     print(sanitize(text), flush=True)  # noqa: T201 - the one place that writes to standard output
-
-
-def print_source(source: str, save: Callable[[Path], object], new_path: Path) -> None:
-    """Print a function that a model has written. If that fails, save it, because the model's replies were paid for."""
-    try:
-        print_line(source)
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        save(new_path)
-        raise LareError(f"nothing can be printed ({error.strerror}); the function is kept in {new_path}") from error
 
 
 def print_messages(messages: Iterable[Message]) -> None:

@@ -6,10 +6,10 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare_rl.cli.design import after_requests, check_function_files
-from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_messages, print_source
+from lare_rl.cli.design import check_function_files, record_replies
+from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_messages
 from lare_rl.errors import LareError
-from lare_rl.util.files import check_new_path, find_free_path, write_bytes
+from lare_rl.util.files import check_new_path, write_bytes
 from lare_rl.util.sanitize import one_line
 
 
@@ -102,11 +102,10 @@ def turn_phi(
     out = check_function_files(out)
     record = None if out is None else out.with_suffix(".json")
     live_model = live.open(model)
-    with after_requests("turns", live_model, live):
-        phi = design_turn_phi(goal, descriptions, turns, live_model, record=record)
-    text = f"# A phi over turns, by {one_line(phi.model)}.\n{phi.source}\n".encode()
-    if out is None:
-        print_source(phi.source, lambda path: write_bytes(path, text), find_free_path(Path(), "turns", ".py"))
-        return
-    write_bytes(out, text)
-    print_line(f"wrote {out} and {record}")
+    with record_replies("turns", live_model, live, record) as recording:
+        phi = design_turn_phi(goal, descriptions, turns, live_model, record=recording)
+        if out is None:
+            print_line(phi.source)
+            return
+        write_bytes(out, f"# A phi over turns, by {one_line(phi.model)}.\n{phi.source}\n".encode())
+        print_line(f"wrote {out} and {record}")

@@ -8,7 +8,6 @@ timesteps are in shared memory, so that a step sends only a short message to a w
 import contextlib
 import os
 import pickle
-import signal
 import subprocess
 import sys
 import threading
@@ -26,7 +25,7 @@ from lare_rl.envs.shared_arrays import SharedArrays, map_arrays, map_current
 from lare_rl.envs.trials import find_interference, time_steps
 from lare_rl.envs.vec_env import Maker, call_env, make_env_at
 from lare_rl.errors import LareError
-from lare_rl.util.processes import kill_group, own_session
+from lare_rl.util.processes import describe_end, kill_group, own_session
 
 __all__ = ["Worker", "end_workers", "pickle_maker"]
 
@@ -121,9 +120,7 @@ class Worker:
         status = self.process.returncode
         if status is None:
             return LareError(f"{self.label} closed its connection")
-        names = {number.value: number.name for number in signal.Signals}  # without most real-time signals
-        reason = f"signal {names.get(-status, -status)}" if status < 0 else f"exit status {status}"
-        return LareError(f"{self.label} died: {reason}")
+        return LareError(f"{self.label} died: {describe_end(status)}")
 
     def close_connection(self) -> None:
         """Ask the worker to end."""

@@ -12,7 +12,7 @@ from lare_rl.report.diagnosis import diagnose
 from lare_rl.report.html import render_figures, render_fold, render_note, render_table, render_tiles
 from lare_rl.report.messages import MESSAGES, WORDS
 from lare_rl.report.reported_run import Curve, ReportedRun, finite, mean_over_seeds
-from lare_rl.report.run_summary import EpisodicRun, RunSummary, find_final_error, summarise_run
+from lare_rl.report.run_summary import EpisodicRun, RunSummary, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding, format_for_reader, format_number, render
@@ -59,16 +59,14 @@ def summarise_runs(
     A run is compared with the best of those on the return of the episode alone, which are not compared themselves.
     """
     episodic = None
-    if episodic_runs := _episodic_runs(runs):
-        best, name = episodic_runs[0], episodic_runs[0].name if len(episodic_runs) > 1 else None
-        error = find_final_error(best, random_returns[0])
-        episodic = EpisodicRun(best.final_return, len(best.final_values(RETURN)), name, error)
+    episodic_runs = [run for run in runs if run.is_episodic and np.isfinite(run.final_return)]
+    if episodic_runs:
+        best = sort_runs(episodic_runs)[0]
+        summary = summarise_run(best, random_returns[0], None)
+        assert summary is not None
+        name = best.name if len(episodic_runs) > 1 else None
+        episodic = EpisodicRun(summary.final_return, len(summary.final_returns), name, summary.final_error)
     return [summarise_run(run, random_returns[0], None if run.is_episodic else episodic) for run in runs]
-
-
-def _episodic_runs(runs: Sequence[ReportedRun]) -> list[ReportedRun]:
-    """Return the runs on the return of the episode alone that have returns, the best first."""
-    return sort_runs(run for run in runs if run.is_episodic and np.isfinite(run.final_return))
 
 
 def render_verdict(

@@ -36,7 +36,6 @@ __all__ = [
     "SEED_STDS",
     "EpisodicRun",
     "RunSummary",
-    "find_final_error",
     "summarise_run",
 ]
 
@@ -295,11 +294,6 @@ def summarise_run(
         has_best_policy=len(task.roles) == 1,
         task=task.name if task.name in shipped_tasks() else "TASK.toml",
     )
-
-
-def find_final_error(reported: ReportedRun, random_returns: Float[np.ndarray, " episodes"]) -> float:
-    """Return the standard error of a run's final return, as in `RunSummary.final_error`."""
-    return grouped_standard_error(reported.final_values(RETURN), _episode_error(reported, random_returns))
 
 
 def _episode_error(reported: ReportedRun, random_returns: Float[np.ndarray, " episodes"]) -> float:

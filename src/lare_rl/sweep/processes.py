@@ -24,10 +24,10 @@ from lare_rl.runs.directory import RunBusyError
 from lare_rl.sweep.jobs import Job, describe_job, train_job
 from lare_rl.sweep.resources import PREALLOCATE, Resources, Slot, assign_slots
 from lare_rl.util.files import make_directory
-from lare_rl.util.processes import own_session
+from lare_rl.util.processes import describe_end, own_session
 from lare_rl.util.sanitize import last_line
 
-__all__ = ["RunningProcesses", "train_in_process", "train_in_processes", "train_on_ray"]
+__all__ = ["train_in_process", "train_in_processes", "train_on_ray"]
 
 LOCK_TIMEOUT_S = 60.0
 """Time to wait for an earlier process that still saves the run."""
@@ -45,13 +45,14 @@ def train_in_processes(
     free_slots: queue.Queue[Slot] = queue.Queue()
     for slot in assign_slots(resources):
         free_slots.put(slot)
-    running = RunningProcesses()
+    running: list[subprocess.Popen] = []
+    stopped = threading.Event()
 
     def train(job: Job) -> str | None:
         slot = free_slots.get()
         try:
             listener(f"{job.name} begins" + (f" again at step {job.step()}" if job.started else ""))
-            return train_in_process(job, slot, running)
+            return train_in_process(job, slot, running, stopped)
         except (LareError, OSError) as error:  # only this run fails; the others continue
             return str(error)
         finally:
@@ -63,44 +64,26 @@ def train_in_processes(
         yield from ((futures[future], future.result()) for future in as_completed(futures))
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
-        running.stop()
+        stopped.set()
+        for process in running:
+            _close_input(process)
         pool.shutdown()
 
 
-class RunningProcesses:
-    """Processes that can be stopped together. After that, none is started."""
-
-    def __init__(self):
-        self._processes: set[subprocess.Popen] = set()
-        self._stopped = False
-        self._lock = threading.Lock()
-
-    def start(self, command: Sequence[str], **options: Any) -> subprocess.Popen | None:
-        """Start a process. Return None after `stop`."""
-        with self._lock:
-            if self._stopped:
-                return None
-            process = subprocess.Popen(command, **options)
-            self._processes.add(process)
-            return process
-
-    def remove(self, process: subprocess.Popen) -> None:
-        """Forget a process that has ended."""
-        with self._lock:
-            self._processes.discard(process)
-
-    def stop(self) -> None:
-        """Close the standard input of all processes, so that they save and end."""
-        with self._lock:
-            self._stopped = True
-            for process in self._processes:
-                assert process.stdin is not None
-                with contextlib.suppress(OSError):
-                    process.stdin.close()
+def _close_input(process: subprocess.Popen) -> None:
+    """Close the standard input of a process, so that it saves and ends."""
+    assert process.stdin is not None
+    with contextlib.suppress(OSError):
+        process.stdin.close()
 
 
-def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | None:
-    """Train a job in a new process, which writes its output to RUN.log. Return the error, or None."""
+def train_in_process(job: Job, slot: Slot, running: list[subprocess.Popen], stopped: threading.Event) -> str | None:
+    """Train a job in a new process, which writes its output to RUN.log. Return the error, or None.
+
+    The process is added to those that are `running`. After `stopped` is set, none is started.
+    """
+    if stopped.is_set():
+        return "it was not started, because the sweep was stopped"
     make_directory(job.directory.parent)
     log = job.directory.with_name(job.directory.name + ".log")
     if slot.cores:  # of this thread. The process inherits them before NumPy starts threads.
@@ -108,7 +91,7 @@ def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | N
     with log.open("a", encoding="utf-8") as file:
         log_start = file.tell()
         # In its own session, so that Ctrl-C reaches it only once, through this process.
-        process = running.start(
+        process = subprocess.Popen(
             [sys.executable, "-P", "-m", "lare_rl.sweep.processes"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -118,30 +101,28 @@ def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | N
             **own_session(),
             env=os.environ | slot.variables,
         )
-        if process is None:
-            return "it was not started, because the sweep was stopped"
+        running.append(process)
+        if stopped.is_set():  # while it started
+            _close_input(process)
         assert process.stdin is not None
         assert process.stdout is not None
         try:
-            with contextlib.suppress(OSError, ValueError):  # the process has ended, or `stop` has closed its input
+            with contextlib.suppress(OSError, ValueError):  # the process has ended, or its input was closed
                 process.stdin.write(json.dumps(describe_job(job)) + "\n")
                 process.stdin.flush()
             error = process.stdout.read().strip()
             process.wait()
         finally:
-            with contextlib.suppress(OSError):
-                process.stdin.close()
+            _close_input(process)
             process.stdout.close()
-            running.remove(process)
     if process.returncode == 0:
         return None if job.done else f"it ended at step {job.step()} of {job.resolved.steps} ({log})"
     if process.returncode < 0:  # a killed process has sent no error
-        names = {number.value: number.name for number in signal.Signals}  # real-time signals have none
-        error = f"it was ended by {names.get(-process.returncode, f'signal {-process.returncode}')}"
+        error = f"it was ended by {describe_end(process.returncode)}"
     elif not error:  # the error that was sent comes first, because a full disk may cut the log short
         with log.open("rb") as file:
             file.seek(log_start)
-            error = last_line(file.read().decode(errors="replace")) or f"exit status {process.returncode}"
+            error = last_line(file.read().decode(errors="replace")) or describe_end(process.returncode)
     return f"{error} ({log})"
 
 

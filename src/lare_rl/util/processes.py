@@ -1,4 +1,4 @@
-"""The cores and the new processes of this program, and locks between processes, on every system."""
+"""The cores and the new processes of this program, how they end, and locks between processes, on every system."""
 
 import contextlib
 import os
@@ -7,7 +7,7 @@ import subprocess
 import sys
 from typing import IO, Any
 
-__all__ = ["kill_group", "n_usable_cores", "own_session", "try_lock", "usable_cores"]
+__all__ = ["describe_end", "kill_group", "n_usable_cores", "own_session", "try_lock", "usable_cores"]
 
 
 def own_session() -> dict[str, Any]:
@@ -22,6 +22,12 @@ def kill_group(leader: int) -> None:
     if sys.platform != "win32":
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(leader, signal.SIGKILL)
+
+
+def describe_end(status: int) -> str:
+    """Return how a process ended, by its `Popen.returncode`: by a signal, or with an exit status."""
+    names = {number.value: number.name for number in signal.Signals}  # without most real-time signals
+    return f"signal {names.get(-status, -status)}" if status < 0 else f"exit status {status}"
 
 
 def usable_cores() -> list[int] | None:

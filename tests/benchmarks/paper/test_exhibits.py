@@ -1,10 +1,8 @@
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from helpers.listeners import AtStep
 from helpers.long_tests import long_case
 from helpers.untrained_runs import invent_training
 from lare_rl.cli import studies
@@ -13,9 +11,8 @@ from lare_rl.errors import LareError
 from lare_rl.llm.recording import shipped_recordings
 from lare_rl.runs.metric_names import CREDIT_ERROR, RETURN, SUMMED_RETURN
 from lare_rl.sweep import processes
-from lare_rl.sweep.jobs import check_job, describe_job, train_job
+from lare_rl.sweep.jobs import check_job
 from lare_rl.sweep.resources import Resources
-from lare_rl.training import train as training
 from paper.exhibits import LARE_SOURCE, exhibit_jobs, exhibits
 from paper.reproduce import REAL, UNTRAINED, listed, reproduce
 from paper.trained import MEANING, TRAVELLED, WON, verdict
@@ -103,17 +100,6 @@ def test_exhibit_page(name, make_page):
         assert "* Environment steps: 600 (the paper: 2,050,000)." in text
 
 
-@pytest.mark.usefixtures("invented_runs")
-def test_figures_claims_and_verdicts(make_page):
-    text = make_page("errors", "laptop").read_text()
-    rd, lare_rrdu = (list(METHODS).index(name) / 10 for name in ("rd", "lare-rrdu"))
-    assert rd < lare_rrdu
-    assert "50,000 environment steps, seeds 0 to 2, draw 0 of the language model." in text
-    assert f"| RD | {rd:.4g}" in text
-    assert "| 0.7 ± 0.5 |" in text
-    assert "| LaRe-RRDu errs less than RD | 0 of 9 | 0 of 9 | 1.000 | the other way round |" in text
-
-
 def test_draws_are_compared_if_there_are_several(make_page, monkeypatch):
     """Three draws that differ much decide nothing, however many seeds agree."""
     train = train_with_score(lambda settings, seed: settings.draw * 1000 + settings.candidates + seed)
@@ -152,19 +138,6 @@ def test_finished_runs_and_remarks_are_kept(make_page, monkeypatch):
     assert trained == ["Reacher-v4/rd-td3"]
 
 
-@pytest.mark.long
-def test_train_exhibit(command, monkeypatch, tmp_path):
-    """From the command line to the page. The runs are in this process, whose compiler is told to hurry."""
-    monkeypatch.setattr(processes, "train_in_process", lambda job, slot, running: train_job(describe_job(job)))
-    monkeypatch.setattr(training, "Terminal", lambda: AtStep(-1, None))
-    status, out, err = command("reproduce", "errors", "--budget", "smoke")
-    assert (status, out) == (0, "wrote results/smoke/errors.md\n"), err
-    assert err.splitlines()[-1].startswith("3 of 3: Reacher-v4/")
-    assert (tmp_path / "runs" / "reproduce" / "smoke" / "Reacher-v4" / "rrdu-td3" / "checkpoint").is_dir()
-    error = re.search(r"\| RD \|.*?\| (\S+) ±", (tmp_path / "results" / "smoke" / "errors.md").read_text())
-    assert np.isfinite(float(error[1]))
-
-
 def test_all_exhibits_continue_after_a_failure(command, monkeypatch):
     def fail_reproduce(name, *_):
         if name == "errors":
@@ -173,10 +146,10 @@ def test_all_exhibits_continue_after_a_failure(command, monkeypatch):
 
     monkeypatch.setattr("paper.reproduce.reproduce", fail_reproduce)
     status, out, err = command("reproduce", "all", "--budget", "smoke")
-    assert status == 2
+    assert status == 1
     names = [name for name in NAMES if not name.startswith(REAL)]
     assert out.split() == [word for name in names if name != "errors" for word in ("wrote", name)]
-    assert err == f"errors: no luck\nlare-rl: 1 of {len(names)} exhibits have no page\n"
+    assert err == f"errors: no luck\n1 of {len(names)} exhibits have no page\n"
 
 
 def test_reproduce_mistakes(command, monkeypatch, tmp_path):
