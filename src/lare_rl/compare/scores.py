@@ -65,9 +65,9 @@ def group_results(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_R
     """
     if not results:
         raise LareError("there are no results to compare")
-    task, *others = sorted({curve.task for curve in results})
-    if others:
-        raise LareError(f"scores have no common scale over {', '.join([task, *others])}: compare each task alone")
+    tasks = sorted({curve.task for curve in results})
+    if len(tasks) > 1:
+        raise LareError(f"scores have no common scale over {', '.join(tasks)}: compare each task alone")
     check_same_tasks((curve.source, curve.config.task) for curve in results if curve.config is not None)
     curves = _index_curves(results, choice.metric)
     steps = _shared_steps(curves, choice)
@@ -77,11 +77,11 @@ def group_results(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_R
         group = [curve for curve in curves.values() if curve.label == label]
         draws = tuple(sorted({curve.draw for curve in group}))
         seeds = tuple(sorted({curve.seed for curve in group}))
-        scores = _fill_scores(label, draws, seeds, task, steps, curves)
+        scores = _fill_scores(label, draws, seeds, tasks[0], steps, curves)
         groups.append(
             LabelScores(
                 label=label,
-                task=task,
+                task=tasks[0],
                 seeds=seeds,
                 draws=draws,
                 steps=tuple(steps),

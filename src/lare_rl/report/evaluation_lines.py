@@ -27,7 +27,7 @@ from lare_rl.training.saved_state import load_actor
 from lare_rl.util.findings import format_for_reader
 from lare_rl.util.statistics import CLEAR_ERRORS, format_mean_std, format_plus_minus
 
-__all__ = ["compare_actions", "describe_evaluation", "evaluation_lines"]
+__all__ = ["describe_evaluation", "evaluation_lines"]
 
 
 def evaluation_lines(
@@ -55,7 +55,7 @@ def evaluation_lines(
     if likeliest is not None:
         yield "The policy samples its actions, as in training. The most likely ones (--deterministic), from the same states:"
         yield from _describe_returns(run, likeliest, best_steps)
-        yield from compare_actions(run, evaluation, likeliest)
+        yield from _compare_actions(run, evaluation, likeliest)
 
 
 def describe_evaluation(
@@ -86,7 +86,7 @@ def describe_evaluation(
             yield f"random actions: {name} {format_mean_std(values)}"
 
 
-def compare_actions(run: Run, sampled: Evaluation, likeliest: Evaluation) -> Iterator[str]:
+def _compare_actions(run: Run, sampled: Evaluation, likeliest: Evaluation) -> Iterator[str]:
     """Say which actions are better, if that is clear. Both evaluations play from the same initial states."""
     for team_index, role in enumerate(run.config.task.roles):
         difference = mean_with_error((likeliest.returns - sampled.returns)[:, :, team_index])
