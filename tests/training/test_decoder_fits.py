@@ -24,7 +24,7 @@ from helpers.small_configs import (
 )
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.data import replay
-from lare_rl.training import compiled, decoder_fits
+from lare_rl.training import decoder_fits
 from lare_rl.training.decoder_fits import (
     PATIENCE,
     FirstFitStoppedError,
@@ -61,16 +61,6 @@ def test_seeds_are_fitted_at_once_or_one_after_the_other():
     seeds = stack_seeds(*(learner_with_episodes(config, seed) for seed in (0, 1)))
     fits = (jax.jit(partial(fit_seeds, config=replace(config, batched=batched))) for batched in (False, True))
     assert_close(*(fit(seeds, keys) for fit in fits), 1e-3, 1e-6)
-
-
-@pytest.mark.parametrize(
-    ("backend", "seconds", "expected"), [("cpu", 9, False), ("card", 1.5, False), ("card", 9, True)]
-)
-def test_seeds_are_fitted_at_once_where_that_is_much_faster(backend, seconds, expected, monkeypatch):
-    times_s = iter((seconds, 1.0))
-    monkeypatch.setattr(compiled.jax, "default_backend", lambda: backend)
-    monkeypatch.setattr(compiled, "_factorise_s", lambda matrices, batched: next(times_s))
-    assert compiled.is_batching_faster(small_config("bayes"), 2) == expected
 
 
 # The first fit.

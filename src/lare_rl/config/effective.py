@@ -6,7 +6,7 @@ from typing import Any
 from lare_rl.algorithms.registry import ALGORITHMS, Consumes
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.methods import METHODS, Method
+from lare_rl.credit.methods import METHODS, Fit, Method
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = [
@@ -75,8 +75,11 @@ def unused_names(settings: ResolvedSettings) -> list[str]:
 
 
 def fits_separately(method: Method, consumes: Consumes) -> bool:
-    """Return whether the gradient updates of the decoder run between iterations. Else each update of the algorithm has one."""
-    return method.uses_gradient and (consumes is Consumes.ROLLOUTS or method.has_separate_fit)
+    """Return whether the gradient updates of the decoder run between iterations. Else each update of the algorithm has one.
+
+    A decoder's own loss is too expensive for every update of the algorithm.
+    """
+    return method.uses_gradient and (consumes is Consumes.ROLLOUTS or method.fit is Fit.DECODER_LOSS)
 
 
 def reads_old_steps(settings: ResolvedSettings) -> bool:

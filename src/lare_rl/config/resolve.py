@@ -8,7 +8,7 @@ from lare_rl.config.settings import ResolvedSettings, Settings, round_up
 from lare_rl.config.train_config import make_train_config
 from lare_rl.config.validity import check_training
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
-from lare_rl.credit.methods import METHODS
+from lare_rl.credit.methods import METHODS, Fit
 from lare_rl.data.replay import required_capacity
 from lare_rl.envs.families import find_score_type
 from lare_rl.envs.interface import EnvSpec
@@ -92,7 +92,7 @@ def _apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
     evaluate_every = round_up(settings.evaluate_every or n_iterations * iteration, iteration)
 
     method = METHODS.find(values["method"])
-    if settings.fit_updates is None and method.has_separate_fit:
+    if settings.fit_updates is None and method.fit is Fit.DECODER_LOSS:
         values["fit_updates"] = max(1, iteration // 50)
     credit = MULTI_AGENT_CREDIT if algorithm.multi_agent else CreditSettings()
     credit_changes = settings.credit.model_dump(exclude_unset=True) if settings.credit else {}

@@ -50,7 +50,10 @@ class CreditConfig:
     masks_steps: bool = False
     """Whether decoders leave out single steps of an agent, as if it had left (`pure_credit`)."""
     batched: bool = False
-    """Whether the device is faster with much work at once (`compiled.is_batching_faster`). It changes the last bits of a fit."""
+    """Whether fits of several seeds are made at once, as on an accelerator. It changes their last bits.
+
+    On a CPU this is never faster by much. Besides, batched calls of LAPACK that run at the same time may wait for each other for ever
+    (jaxlib 0.10, `ParallelBatchMap`)."""
     payments: PaymentRule = PAID_AT_END
     """When the environment pays."""
     group: str | None = None
@@ -84,11 +87,6 @@ class CreditConfig:
     def is_exact(self) -> bool:
         """Whether the proxy rewards of an episode are corrected to add up to its return."""
         return self.credit_specs[0].is_exact
-
-    @property
-    def predicts_ahead(self) -> bool:
-        """Whether the sums of proxy rewards are computed after each fit. For rollouts, they are computed with each update."""
-        return self.is_exact and self.consumes is not Consumes.ROLLOUTS
 
     @property
     def has_fixed_segments(self) -> bool:

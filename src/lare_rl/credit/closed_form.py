@@ -49,7 +49,6 @@ from lare_rl.nn.normalise import RunningMeanStd, running_std
 
 __all__ = [
     "ClosedForm",
-    "drop_start_value",
     "fit",
     "fit_signs",
     "init",
@@ -216,7 +215,7 @@ def _score_type_statistics(state: ClosedForm, score_type: Int[Array, ""] | int) 
         return statistics
     unit = jnp.ones(len(statistics.mean)).at[basis.n_features].set(_start_value_unit(state))
     products = statistics.products * jnp.outer(unit, unit)
-    return drop_start_value(
+    return _drop_start_value(
         statistics._replace(mean=statistics.mean * unit, products=products), basis.n_features, score_type
     )
 
@@ -227,7 +226,7 @@ def _start_value_unit(state: ClosedForm) -> Float[Array, ""]:
     return 1 / jnp.where(mean > 0, mean, 1)
 
 
-def drop_start_value(
+def _drop_start_value(
     statistics: SufficientStatistics, column: int, score_type: Int[Array, ""] | int
 ) -> SufficientStatistics:
     """Return the sums by which 1/T, at `column`, has the weight 0 unless the score is a sum: an average has a constant part already."""

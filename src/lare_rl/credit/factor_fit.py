@@ -7,38 +7,29 @@ by a twentieth. The factors are standardised over all episodes. R^2 thus compare
 If episodes belong to levels, each level has an intercept beside the factors, as in training (`closed_form.py`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
-from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
-from lare_rl.credit import evidence, explanation
+from lare_rl.credit import closed_form, decoder_state, explanation, learning
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.closed_form import FIT_GROWTH, MAX_EVIDENCE_ROUNDS, drop_start_value
+from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoder_state import CreditBatch
-from lare_rl.credit.evidence import SufficientStatistics
-from lare_rl.credit.explanation import Explanation, ExplanationState
-from lare_rl.credit.learning import mean_features
-from lare_rl.credit.precisions import Posterior
-from lare_rl.credit.prequential import Predictions
-from lare_rl.credit.score_type import (
-    ScoreType,
-    ScoreTypeEstimate,
-    compare_score_types,
-    is_better,
-    score_types_to_fit,
-)
+from lare_rl.credit.explanation import Explanation
+from lare_rl.credit.methods import METHODS
+from lare_rl.credit.prequential import Predictions, empty_predictions
+from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate, compare_score_types, is_better
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.nn.normalise import RunningMeanStd
 from lare_rl.util.float64 import float64
 from lare_rl.util.statistics import r_squared
 
-__all__ = ["FactorAssessment", "add_episodes", "assess_factors", "predict_returns"]
+__all__ = ["FactorAssessment", "assess_factors", "explain_returns", "predict_returns"]
 
 N_FIRST = 10
 """The number of episodes before the first prediction."""
@@ -78,130 +69,129 @@ def assess_factors(
         score: `sum` or `average`, if the type of the score is known, or `binary`, which says nothing about these two.
         level: the level of each episode, from 0 on, if there are levels.
     """
-    length = np.array([len(episode) for episode in inputs])
-    fixed_length = len(set(length)) == 1
-    score_types = score_types_to_fit(score or "auto", fixed_length, allow_log_odds=False)
-    one_hot = np.zeros((len(returns), 0)) if level is None else np.eye(int(level.max()) + 1)[level]
-    with_levels = replace(basis, n_levels=one_hot.shape[1], start_value=True)
-    later_returns = returns[N_FIRST:]
+    factors = [rows[..., : basis.n_factors] for rows in inputs]
+    no_factors, no_level = [np.zeros_like(rows) for rows in factors], np.zeros(len(returns), int)
+    fixed_length = len(set(map(len, inputs))) == 1
+    predictions, start_value = predict_returns(factors, alive, returns, level)
+    index, estimate = int(score == "average" and not fixed_length), None
+    if score not in ("sum", "average") and not fixed_length:
+        index = int(is_better(predictions, ScoreType.AVERAGE, ScoreType.SUM))
+        estimate = compare_score_types(predictions, (ScoreType.SUM, ScoreType.AVERAGE), index)
+    length_r2 = level_r2 = None
+    if index == ScoreType.SUM and not fixed_length:
+        lengths_alone, _ = predict_returns(no_factors, alive, returns, None if level is None else no_level)
+        length_r2, _ = _r2(lengths_alone, returns, ScoreType.SUM)
+    if level is not None:
+        levels_alone, _ = predict_returns(no_factors, alive, returns, level)
+        level_r2, _ = _r2(levels_alone, returns, -1)  # an average, because a sum would know the lengths
+    r2, r2_error = _r2(predictions, returns, index)
+    start_value = start_value if index == ScoreType.SUM else 0.0
+    return FactorAssessment(
+        r2,
+        r2_error,
+        length_r2,
+        level_r2,
+        score_type=estimate,
+        explanation=explain_returns(inputs, alive, returns, basis, index, start_value),
+    )
+
+
+def _r2(predictions: Predictions, returns: Float[np.ndarray, " episodes"], index: int) -> tuple[float, float]:
+    """Return R^2 of the predictions by the score type at `index`, and its standard error."""
+    later = returns[N_FIRST:]
+    return r_squared(later, np.asarray(predictions.predicted, np.float64)[: len(later), index])
+
+
+def predict_returns(
+    factors: Sequence[Float[np.ndarray, "_ agents factors"]],
+    alive: Sequence[Bool[np.ndarray, "_ agents"]],
+    returns: Float[np.ndarray, " episodes"],
+    level: Int[np.ndarray, " episodes"] | None = None,
+) -> tuple[Predictions, float]:
+    """Predict all returns but the first `N_FIRST`, each by a fit to episodes before it.
+
+    Returns:
+        The predictions by a sum and by an average, or by a sum alone if all episodes have the same length, which makes both the same. Also
+        the start value of the sum, by the last fit.
+    """
+    count, (_, agents, n_factors) = len(returns), factors[0].shape
+    spec = CreditSpec(
+        method=replace(METHODS["lare-linear"], decoder="additive"),
+        settings=CreditSettings(),
+        n_factors=n_factors,
+        observation_size=0,
+        action_size=0,
+        single_agent=agents == 1,
+        agents=agents,
+        max_steps=max(map(len, factors)),
+        fixed_length=len(set(map(len, factors))) == 1,
+        has_groups=level is not None,
+    )
+    state = decoder_state.init(jax.random.key(0), spec)
+    closed = closed_form.init(spec.basis, spec.score_types)
+    state = state._replace(
+        closed_form=closed_form.reset_statistics(closed, _statistics(factors, alive)),
+        predictions=empty_predictions(1, count),
+        score_type_predictions=empty_predictions(2, count) if len(spec.score_types) > 1 else None,
+    )
     with float64():
-        features, state = add_episodes(inputs, alive, returns, replace(basis, start_value=True))
-        columns = np.hstack([features, length.mean() / length[:, None], one_hot])  # of about the same size
-        column, n_features = np.arange(columns.shape[1]), features.shape[1]
-        predict = partial(predict_returns, returns=returns, length=length, basis=with_levels)
-        fits = [predict(columns, score_type=score_type) for score_type in score_types]
-        index, estimate = 0, None
-        if len(score_types) > 1:
-            predictions = Predictions(
-                n_episodes=jnp.asarray(float(len(later_returns))),
-                returns=jnp.asarray(later_returns),
-                predicted=jnp.stack([predicted for predicted, _ in fits], axis=1),
-                level=jnp.zeros(len(later_returns), int),
-            )
-            index = int(is_better(predictions, ScoreType.AVERAGE, ScoreType.SUM))
-            estimate = compare_score_types(predictions, score_types, index)
-        score_type, (predicted, weight) = score_types[index], fits[index]
-        length_r2 = level_r2 = None
-        if score_type is ScoreType.SUM and not fixed_length:
-            lengths_alone = np.where(column == n_features, columns, 0)
-            length_r2 = r_squared(later_returns, predict(lengths_alone, score_type=score_type)[0])[0]
-        if level is not None:
-            levels_alone = np.where(column > n_features, columns, 0)  # an average, because a sum would know the lengths
-            level_r2 = r_squared(later_returns, predict(levels_alone, score_type=ScoreType.AVERAGE)[0])[0]
-        start_value = length.mean() * weight[basis.n_factor_features]
-        explained = jax.tree.map(np.asarray, _explain(state, score_type, start_value))
-    r2, r2_error = r_squared(later_returns, predicted)
-    return FactorAssessment(r2, r2_error, length_r2, level_r2, score_type=estimate, explanation=explained)
+        for number, episode in enumerate(_batches(factors, alive, returns, level), start=1):
+            state = _predict_then_update(state, episode, spec)
+            if number >= N_FIRST and closed_form.is_due(state.closed_form):
+                state = _fit(state, spec)
+    assert state.closed_form is not None
+    return state.score_type_predictions or state.predictions, float(state.closed_form.start_value[ScoreType.SUM])
 
 
-def add_episodes(
+_predict_then_update = jax.jit(learning.predict_then_update, static_argnums=2)
+_fit = jax.jit(learning.fit_closed_form, static_argnums=1)
+
+
+def explain_returns(
     inputs: Sequence[Float[np.ndarray, "_ agents inputs"]],
     alive: Sequence[Bool[np.ndarray, "_ agents"]],
     returns: Float[np.ndarray, " episodes"],
     basis: Basis,
-) -> tuple[Float[np.ndarray, "episodes features"], ExplanationState]:
-    """Return the mean features of each episode, with inputs standardised over all steps, and the sums that explain the returns."""
-    valid = np.concatenate([rows[mask] for rows, mask in zip(inputs, alive, strict=True)]).astype(np.float64)
-    moments = len(valid), valid.mean(axis=0), len(valid) * valid.var(axis=0)
-    state = explanation.init_explanation(
-        RunningMeanStd(*(jnp.asarray(values, jnp.float32) for values in moments)), basis
-    )
-    means, max_steps = [], max(map(len, inputs))
-    for rows, mask, return_ in zip(inputs, alive, returns, strict=True):
-        padding = (0, max_steps - len(rows)), (0, 0)  # to one length, so that `_add_episode` is compiled once
-        episode = CreditBatch(
-            inputs=jnp.asarray(np.pad(rows, (*padding, (0, 0))), jnp.float32),
-            episode_index=jnp.asarray(np.arange(max_steps) >= len(rows), jnp.int32),
-            length=jnp.array([len(rows)], jnp.int32),
-            mean_reward=jnp.array([return_ / len(rows)]),
-            mask=jnp.ones(1),
-            alive=jnp.asarray(np.pad(mask, padding)),
-        )
-        mean, state = _add_episode(state, episode)
-        means.append(mean)
-    return np.stack(means), state
+    score_type: int,
+    start_value: float,
+) -> Explanation:
+    """Explain the returns of some episodes by their inputs, standardised over all steps."""
+    state = explanation.init_explanation(_statistics(inputs, alive), replace(basis, start_value=True))
+    with float64():
+        for episode in _batches(inputs, alive, returns):
+            state = _add_to_explanation(state, episode)
+        return jax.tree.map(np.asarray, _explain(state, score_type, start_value))
 
 
-@jax.jit
-def _add_episode(state: ExplanationState, episode: CreditBatch) -> tuple[Float[Array, " features"], ExplanationState]:
-    mean = mean_features(state.closed_form.decoder, episode)[0]
-    return mean, explanation.add_to_explanation(state, episode)
-
-
+_add_to_explanation = jax.jit(explanation.add_to_explanation)
 _explain = jax.jit(explanation.explain)
 
 
-def predict_returns(
-    columns: Float[np.ndarray, "episodes columns"],
+def _statistics(
+    inputs: Iterable[Float[np.ndarray, "_ agents inputs"]], alive: Iterable[Bool[np.ndarray, "_ agents"]]
+) -> RunningMeanStd:
+    valid = np.concatenate([rows[mask] for rows, mask in zip(inputs, alive, strict=True)]).astype(np.float64)
+    moments = len(valid), valid.mean(axis=0), len(valid) * valid.var(axis=0)
+    return RunningMeanStd(*(jnp.asarray(values, jnp.float32) for values in moments))
+
+
+def _batches(
+    inputs: Sequence[Float[np.ndarray, "_ agents inputs"]],
+    alive: Sequence[Bool[np.ndarray, "_ agents"]],
     returns: Float[np.ndarray, " episodes"],
-    length: Int[np.ndarray, " episodes"],
-    basis: Basis,
-    score_type: int,
-) -> tuple[Float[np.ndarray, " later_episodes"], Float[np.ndarray, " used_columns"]]:
-    """Return R_hat of all episodes but the first `N_FIRST`, each by a fit to episodes before it, and the weights of the last fit.
-
-    Call this within `float64()`. `columns` are the mean features of each episode, a multiple of 1/T, and which level it has. Functions of
-    raw features are not used.
-    """
-    features, group_index = columns[:, _is_used(basis)], basis.column_group_index[_is_used(basis)]
-    state = evidence.empty_statistics(len(group_index)), evidence.init_posterior(group_index)
-    statistics, posterior = jax.tree.map(lambda leaf: leaf.astype(float), state)
-    blocks = list(_growing_blocks(len(returns)))
-    max_size = max((end - start for start, end in blocks), default=1)
-    predicted = [np.zeros(0)]
-    for (start, end), (_, next_end) in pairwise(blocks):
-        block = (features[start:end], returns[start:end], length[start:end])
-        padding = (0, max_size - (end - start))  # to one size, so that `_add_and_fit` is compiled once
-        block = (np.pad(values, (padding, *[(0, 0)] * (values.ndim - 1))) for values in block)
-        statistics, posterior = _add_and_fit(statistics, posterior, *block, score_type=score_type, basis=basis)
-        output = features[end:next_end] @ np.asarray(posterior.weight) + float(posterior.bias)
-        predicted.append(output if score_type == ScoreType.AVERAGE else length[end:next_end] * output)
-    return np.concatenate(predicted), np.asarray(posterior.weight)
-
-
-def _is_used(basis: Basis) -> Bool[np.ndarray, " columns"]:
-    return np.append(basis.is_factor_feature, np.ones(basis.n_columns - basis.n_features, bool))
-
-
-@partial(jax.jit, static_argnames="basis")
-def _add_and_fit(
-    statistics: SufficientStatistics,
-    posterior: Posterior,
-    features: Float[Array, "episodes features"],
-    returns: Float[Array, " episodes"],
-    length: Int[Array, " episodes"],
-    score_type: Int[Array, ""] | int,
-    basis: Basis,
-) -> tuple[SufficientStatistics, Posterior]:
-    statistics = evidence.add_episodes(statistics, features, returns, length)
-    group_index = basis.column_group_index[_is_used(basis)]
-    sums = drop_start_value(statistics, basis.n_factor_features, score_type)
-    return statistics, evidence.fit(sums, score_type, group_index, posterior, MAX_EVIDENCE_ROUNDS)
-
-
-def _growing_blocks(count: int) -> Iterator[tuple[int, int]]:
-    """Yield start and end of each block of episodes that are added together: the first ones, then about a twentieth more each time."""
-    start, end = 0, min(N_FIRST, count)
-    while start < count:
-        yield start, end
-        start, end = end, min(count, max(end + 1, int(FIT_GROWTH * end)))
+    level: Int[np.ndarray, " episodes"] | None = None,
+) -> Iterator[CreditBatch]:
+    """Yield each episode as a batch. All are padded to one length, so that functions are compiled once."""
+    max_steps = max(map(len, inputs))
+    for i, (rows, mask, return_) in enumerate(zip(inputs, alive, returns, strict=True)):
+        padding = (0, max_steps - len(rows)), (0, 0)
+        arrays: dict[str, Any] = {
+            "inputs": np.pad(rows, (*padding, (0, 0))).astype(np.float32),
+            "episode_index": (np.arange(max_steps) >= len(rows)).astype(np.int32),
+            "length": np.array([len(rows)], np.int32),
+            "mean_reward": np.array([return_ / len(rows)]),
+            "mask": np.ones(1, np.float32),
+            "alive": np.pad(mask, padding),
+            "level": None if level is None else level[i : i + 1].astype(np.int32),
+        }
+        yield CreditBatch(**arrays)

@@ -60,11 +60,6 @@ class InputNames:
         """Whether the inputs contain anything else than factors."""
         return self.names != ("factors",)
 
-    @property
-    def depends_on_scored_observation(self) -> bool:
-        """Whether the raw features depend on which observations the task's `scored_observation` names."""
-        return "scored_observation" in self.names
-
 
 def input_sizes(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> tuple[tuple[str, int], ...]:
     """Return the name of each input and how many numbers it has, by the sizes of `factors`, `observation` and `action`.

@@ -52,11 +52,6 @@ class Fit(StrEnum):
         return self in (Fit.SAMPLED_STEPS, Fit.SAMPLED_STEPS_UNBIASED, Fit.LIKELIHOOD)
 
     @property
-    def separate(self) -> bool:
-        """Whether the fit is too expensive for every update of the algorithm, and so runs between chunks of updates."""
-        return self is Fit.DECODER_LOSS
-
-    @property
     def settings(self) -> frozenset[str]:
         """The names of the `CreditSettings` that the fit reads."""
         match self:
@@ -119,11 +114,6 @@ class Method:
         return self.reward not in (Reward.TRUE, Reward.EPISODIC)
 
     @property
-    def has_separate_fit(self) -> bool:
-        """Whether its fit is too expensive for every update of the algorithm."""
-        return self.fit is not None and self.fit.separate
-
-    @property
     def calibrated(self) -> bool:
         """Whether its rewards are in the unit of the true ones, because they are fitted to add up to returns."""
         return self.reward is Reward.PROXY
@@ -141,7 +131,7 @@ class Method:
     @property
     def uses_scored_observation(self) -> bool:
         """Whether it matters which observations the task's `scored_observation` names."""
-        return self.needs_phi or (self.inputs is not None and self.inputs.depends_on_scored_observation)
+        return self.needs_phi or (self.inputs is not None and "scored_observation" in self.inputs.names)
 
     @property
     def uses_gradient(self) -> bool:

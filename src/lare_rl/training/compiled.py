@@ -6,23 +6,19 @@ nothing is transferred between two iterations. Both are Algorithm 1 of the LaRe 
 """
 
 import contextlib
-import timeit
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Int, Key
 
 from lare_rl.algorithms.batches import Metrics
 from lare_rl.algorithms.registry import Consumes
 from lare_rl.config.train_config import TrainConfig
-from lare_rl.credit.score_type import ScoreType
 from lare_rl.data.trajectory import Trajectory, empty_trajectory
 from lare_rl.envs.interface import JaxEnv
-from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.phi.graph import Graph
 from lare_rl.training import collect_device, off_policy, on_policy, sequences
 from lare_rl.training.collect_device import VecEnvState
@@ -43,19 +39,9 @@ __all__ = [
     "compile_functions",
     "compile_loop",
     "init_seeds",
-    "is_batching_faster",
     "learner_shape",
     "merge_metrics",
 ]
-
-MIN_SPEED_UP = 2.0
-"""The speed-up from which `is_batching_faster` is true. A smaller one may be noise, and then equal runs would choose differently."""
-N_REPETITIONS = 5
-"""How often `is_batching_faster` times the factorisations."""
-N_STARTS = 3
-"""The number of starts of `evidence.fit`. Each start factorises a matrix."""
-MIN_FEATURES = 32
-"""The least size of the matrices that `is_batching_faster` factorises."""
 
 
 class CompiledFunctions(NamedTuple):
@@ -313,25 +299,3 @@ def merge_metrics(old: Metrics, new: Metrics) -> tuple[Metrics, Bool[Array, " se
     is_new = new["algorithm/updates"] > 0
     keeps_old = ~is_new & (old.get("algorithm/updates", 0) > 0)
     return old | {name: jnp.where(keeps_old, old.get(name, values), values) for name, values in new.items()}, is_new
-
-
-def is_batching_faster(config: TrainConfig, n_seeds: int) -> bool:
-    """Measure whether this device factorises the matrices of all fits faster at once than one after the other.
-
-    It is false on a CPU: there it is never faster by much, and a choice by time would make runs differ. Besides, batched calls of
-    LAPACK that run at the same time may wait for each other for ever (jaxlib 0.10, `ParallelBatchMap`).
-    """
-    if config.method.fit is None or jax.default_backend() == "cpu":
-        return False
-    n_features = max(MIN_FEATURES, *(spec.basis.n_features for spec in config.credit_specs))
-    n_fits = n_seeds // config.n_devices * N_STARTS * len(ScoreType)
-    with float64():
-        matrices = jnp.asarray(np.eye(n_features) + np.full((n_fits, n_features, n_features), 0.5))
-        return _factorise_s(matrices, batched=False) > MIN_SPEED_UP * _factorise_s(matrices, batched=True)
-
-
-def _factorise_s(matrices: Float[Array, "fits features features"], *, batched: bool) -> float:
-    """Return the shortest time of a factorisation of all matrices (s), after one that compiles."""
-    factorise = jax.jit(lambda matrices: map_leading_axis(jnp.linalg.cholesky, matrices, batched=batched))
-    jax.block_until_ready(factorise(matrices))
-    return min(timeit.repeat(lambda: jax.block_until_ready(factorise(matrices)), number=1, repeat=N_REPETITIONS))

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from lare_rl.algorithms.registry import Consumes
 from lare_rl.config.train_config import CreditConfig
 from lare_rl.credit import closed_form, learning
 from lare_rl.credit.closed_form import ClosedForm
@@ -48,7 +49,7 @@ def learn_returns(learner: Learner, config: CreditConfig) -> Learner:
     decoders = jax.lax.cond(jnp.any(is_due), learn, lambda unchanged: unchanged, learner.decoders)
     n_now = jnp.where(is_due[:, None], buffer.current_episode, n_learned).astype(n_learned.dtype)
     learned = learner._replace(decoders=decoders, n_learned=n_now)
-    if not config.predicts_ahead:
+    if not config.is_exact or config.consumes is Consumes.ROLLOUTS:  # rollouts: predicted with each update
         return learned
     (old, *_), (new, *_) = map(_closed_forms, (learner.decoders, decoders))
     is_new = (old.n_fitted != new.n_fitted)[:, None]  # a new fit changes the proxy rewards of all episodes

@@ -17,7 +17,7 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.policy import actor_shape, get_actor
 from lare_rl.util.provenance import code_version
 
-__all__ = ["SavedState", "load_actor", "load_learner"]
+__all__ = ["SavedState", "load_actor", "load_learner", "make_run_config"]
 
 
 class SavedState(NamedTuple):
@@ -36,19 +36,22 @@ class SavedState(NamedTuple):
         return get_actor(self.learner.algorithm, self.metadata["step"], self.config)
 
 
+def make_run_config(run: Run, n_devices: int = 1) -> TrainConfig:
+    """Return the configuration of a run on this machine, with its seeds spread over `n_devices` devices."""
+    config = make_train_config(run.config.task, run.config.settings, run.functions, n_devices)
+    return replace(config, batched=jax.default_backend() != "cpu")
+
+
 def load_learner(run: Run, n_devices: int = 1) -> SavedState:
     """Load the last checkpoint of a run. Its configuration spreads the seeds over `n_devices` devices.
 
     Raises:
         LareError: there is no checkpoint, it is damaged, or it is of a version of LaRe whose state has another structure.
     """
-    config = make_train_config(run.config.task, run.config.settings, run.functions, n_devices)
+    config = make_run_config(run, n_devices)
     try:
         learner, metadata, arrays = checkpoint.load(run.checkpoint, learner_shape(config, len(run.seeds)))
-        batched = (
-            metadata.get("batched", False) and jax.default_backend() != "cpu"
-        )  # as in `compiled.is_batching_faster`
-        return SavedState(replace(config, batched=batched), learner, metadata, arrays)
+        return SavedState(config, learner, metadata, arrays)
     except LareError as error:
         if run.config.lare == code_version():
             raise
@@ -65,7 +68,7 @@ def load_actor(run: Run, best: bool = False) -> tuple[TrainConfig, Any, Int[np.n
         LareError: no actor has been saved.
     """
     if best:
-        config = make_train_config(run.config.task, run.config.settings, run.functions)
+        config = make_run_config(run)
         best_policy = load_best(run.checkpoint, actor_shape(config, len(run.seeds)), len(run.seeds))
         return config, best_policy.actor, best_policy.step
     state = load_learner(run)

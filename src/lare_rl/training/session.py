@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Key
 from lare_rl.algorithms.batches import Metrics
 from lare_rl.algorithms.off_policy import OffPolicySettings
 from lare_rl.config.settings import ResolvedSettings
-from lare_rl.config.train_config import TrainConfig, make_train_config
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.explanation_text import MIN_EXPLAINED_EPISODES
 from lare_rl.data.trajectory import Trajectory, empty_trajectory
 from lare_rl.envs.workers import close_idle_workers
@@ -32,7 +32,6 @@ from lare_rl.training.compiled import (
     compile_functions,
     compile_loop,
     init_seeds,
-    is_batching_faster,
     learner_shape,
     merge_metrics,
 )
@@ -44,7 +43,7 @@ from lare_rl.training.explain import compile_explanation
 from lare_rl.training.learner import Learner, abandon_episodes
 from lare_rl.training.policy import actor_shape, get_actor
 from lare_rl.training.rewards import team_metrics
-from lare_rl.training.saved_state import load_learner
+from lare_rl.training.saved_state import load_learner, make_run_config
 from lare_rl.training.seed_axis import count_seed_devices
 from lare_rl.training.streams import Stream, seed_keys, stream_keys
 from lare_rl.util.blas import load_linear_algebra, one_blas_thread
@@ -260,7 +259,6 @@ class Session:
             "metrics_length": self.metrics_bytes,
             "fitted": self.first_fit_done,
             "function_sha256": [function.digest for function in self.run.functions],
-            "batched": self.config.batched,
         }
         arrays = {f"latest/{name}": np.asarray(values) for name, values in self.latest_metrics.items()}
         arrays |= {f"collector/{name}": values for name, values in self.collector.state_dict().items()}
@@ -302,9 +300,7 @@ class Session:
 def start_session(run: Run) -> Session:
     """Return a session before its first step."""
     n_devices = count_seed_devices(len(run.seeds))
-    config = make_train_config(run.config.task, run.config.settings, run.functions, n_devices)
-    config = replace(config, batched=is_batching_faster(config, len(run.seeds)))
-    return _make_session(run, config, None)
+    return _make_session(run, make_run_config(run, n_devices), None)
 
 
 def restore_session(run: Run) -> tuple[Session, list[str]]:

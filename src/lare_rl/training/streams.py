@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from enum import IntEnum
+from functools import partial
 from typing import Any
 
 import jax
@@ -64,16 +65,12 @@ def stream_keys(
 
 def host_noise(rng: np.random.Generator, noise: Noise, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
     """Draw noise for a policy that collects on the host."""
-    match noise:
-        case Noise.NORMAL:
-            return rng.standard_normal(shape).astype(np.float32)
-        case Noise.GUMBEL:
-            return rng.gumbel(size=shape).astype(np.float32)
-        case Noise.UNIFORM:
-            return rng.random(shape, np.float32)
+    uniform = partial(rng.random, dtype=np.float32)
+    draw = {Noise.NORMAL: rng.standard_normal, Noise.GUMBEL: rng.gumbel, Noise.UNIFORM: uniform}[noise]
+    return draw(size=shape).astype(np.float32)
 
 
 def device_noise(key: Array, noise: Noise, shape: tuple[int, ...]) -> Float[Array, "..."]:
     """Draw the noise of `host_noise` in compiled code."""
-    sample = {Noise.NORMAL: jax.random.normal, Noise.GUMBEL: jax.random.gumbel, Noise.UNIFORM: jax.random.uniform}
-    return sample[noise](key, shape)
+    draw = {Noise.NORMAL: jax.random.normal, Noise.GUMBEL: jax.random.gumbel, Noise.UNIFORM: jax.random.uniform}[noise]
+    return draw(key, shape)
