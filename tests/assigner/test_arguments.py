@@ -22,26 +22,6 @@ def test_environments_are_read_by_value(env_ids):
     assert read([1, 2], env_ids=env_ids).env_ids == [0, 1]
 
 
-def test_lists_are_needed():
-    for env_ids, words in ((3, "is 3"), (np.array(3), r"is array\(3\)")):
-        with pytest.raises(LareError, match=f"env_ids {words}: give a list"):
-            read([1, 2], env_ids=env_ids)
-    with pytest.raises(LareError, match="group is 5: give a list"):
-        to_levels(small_assigner(groups=True).config, 5, read([1, 2]), {})
-
-
-def test_score_is_a_single_number():
-    assert to_score(np.array([[2.0]]), "the score") == 2.0
-    with pytest.raises(LareError, match=r"the score is \[1\.0, 2\.0\].*single number"):
-        to_score([1.0, 2.0], "the score")
-
-
-@pytest.mark.parametrize("env_ids", [np.zeros((2, 1)), [([0],), 1], [float("nan"), 1]])
-def test_environment_that_cannot_be_a_key_is_refused(env_ids):
-    with pytest.raises(LareError, match=r"env_id .*hashable"):
-        read([1, 2], env_ids=env_ids)
-
-
 def test_episode_is_ended_and_dropped_by_value():
     credit = small_assigner()
     for env_id in ("a", 5):
@@ -58,18 +38,34 @@ def test_team_reward_is_the_mean_over_the_agents_alive():
     assert read([2.0, 6.0], agents=2).reward.tolist() == [2.0, 6.0]
 
 
+ROWS = np.zeros(2)
+
+
 @pytest.mark.parametrize(
-    ("reward", "alive", "message"),
+    ("call", "message"),
     [
-        (np.zeros((2, 3)), None, r"reward .*\(2, 3\).* each agent.* 2 steps"),
-        (np.zeros(2), np.ones(2), r"alive .*\(2,\).* 2 steps and 2 agents"),
-        (np.zeros(2), [[1], [1, 0]], "alive .*numbers"),
-        (np.zeros(2), [[1, 2], [1, 0]], "alive .*true or false"),
+        (lambda: read(ROWS, env_ids=3), "env_ids is 3: give a list"),
+        (lambda: read(ROWS, env_ids=np.array(3)), r"env_ids is array\(3\): give a list"),
+        (lambda: read(ROWS, env_ids=np.zeros((2, 1))), "env_id .*hashable"),
+        (lambda: read(ROWS, env_ids=[([0],), 1]), "env_id .*hashable"),
+        (lambda: read(ROWS, env_ids=[float("nan"), 1]), "env_id .*hashable"),
+        (lambda: read(np.zeros((2, 3)), agents=2), r"reward .*\(2, 3\).* each agent.* 2 steps"),
+        (lambda: read(ROWS, agents=2, alive=np.ones(2)), r"alive .*\(2,\).* 2 steps and 2 agents"),
+        (lambda: read(ROWS, agents=2, alive=[[1], [1, 0]]), "alive .*numbers"),
+        (lambda: read(ROWS, agents=2, alive=[[1, 2], [1, 0]]), "alive .*true or false"),
+        (lambda: to_levels(small_assigner(groups=True).config, 5, read(ROWS), {}), "group is 5: give a list"),
+        (lambda: to_score([1.0, 2.0], "the score"), r"the score is \[1\.0, 2\.0\].*single number"),
+        # As int64 it would be negative, which is no step.
+        (lambda: to_step_ids(np.array([2**63], np.uint64)), "steps are"),
     ],
 )
-def test_team_arguments_are_refused(reward, alive, message):
+def test_arguments_are_refused(call, message):
     with pytest.raises(LareError, match=message):
-        read(reward, agents=2, alive=alive)
+        call()
+
+
+def test_score_may_have_axes():
+    assert to_score(np.array([[2.0]]), "the score") == 2.0
 
 
 def test_one_hot_rows_are_floats():
@@ -78,8 +74,3 @@ def test_one_hot_rows_are_floats():
     assert to_rows(config, *rows)[1].shape == (4, 3)
     with pytest.raises(LareError, match=r"action .*\(4, 3, 3\).*\(steps, 3\).*one-hot rows of floats"):
         to_rows(config, rows[0], rows[1].astype(int), rows[2])
-
-
-def test_number_that_no_step_has_is_refused():
-    with pytest.raises(LareError, match="steps are"):
-        to_step_ids(np.array([2**63], np.uint64))  # as int64 it would be negative, which is no step

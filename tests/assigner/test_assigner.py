@@ -24,7 +24,7 @@ from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.assigner.decoder_learner import MAX_FIRST_UPDATES
 from lare_rl.assigner.explain import explain
 from lare_rl.credit import decoder_state
-from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
+from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
@@ -92,25 +92,6 @@ def test_rewards_of_every_method(method, function):
     metrics = credit.metrics()
     assert (metrics["credit/episodes"], metrics["credit/dropped"]) == (12, 0)
     assert (metrics["credit/fits"] > 0) == np.isfinite(metrics["credit/loss"]) == METHODS[method].uses_gradient
-
-
-@pytest.mark.long
-def test_must_learn_the_reward_from_factors_that_contain_it(phi):
-    """R^2 needs eight predicted returns, and does not depend on how often it is asked."""
-    credit, silent = small_assigner("lare-linear", phi), small_assigner("lare-linear", phi)
-    has_r2 = []
-    for episode in random_episodes([10] * 40):
-        credit.add_episode(*episode)
-        silent.add_episode(*episode)
-        has_r2.append(bool(np.isfinite(credit.metrics()["credit/return_r2"])))
-    # From one episode, a decoder in closed form learns the mean reward only: the third return is the first that is predicted.
-    assert has_r2 == [False] * 9 + [True] * 31
-    for assigner in (credit, silent):
-        assert 0.9 < assigner.metrics()["credit/return_r2"] <= 1
-        assert float(assigner.learner.decoder.closed_form.n_fitted) > 38
-    (new,) = random_episodes([50], seed=1)
-    np.testing.assert_allclose(credit.rewards(*new[:3]), new.reward, atol=0.01)
-    assert credit.explanation()
 
 
 def test_rewards_depend_on_the_seed_and_the_newest_decoder():
@@ -688,19 +669,6 @@ def test_finished_episodes_are_learned_before_they_are_overwritten():
     assert credit.learner.n_learned == 40
 
 
-def test_restored_assigner_keeps_what_it_learned(tmp_path):
-    """Also if its steps were not saved, and the statistics of its inputs change."""
-    credit = small_assigner("bayes")
-    add_episodes(credit, random_episodes([10] * 60))
-    credit.fit()
-    credit.save(tmp_path / "saved", episodes=False)
-    loaded = CreditAssigner.load(tmp_path / "saved")
-    far = random_episode(10, np.random.default_rng(1))
-    loaded.add_episode(far.observation + 9, far.action, far.next_observation + 9, far.reward)
-    loaded.fit()
-    assert float(loaded.learner.decoder.closed_form.n_fitted) == 61
-
-
 def test_residuals_of_pending_steps():
     """The first steps of an episode are asked for while its last ones have no inputs yet."""
     credit = small_assigner("bayes", settings=SMALL_CREDIT.model_copy(update={"exact": "spread"}))
@@ -710,23 +678,6 @@ def test_residuals_of_pending_steps():
     first = credit.rewards_at(step_ids[:2])
     np.testing.assert_array_equal(credit.rewards_at(step_ids)[:2], first)
     assert credit.rewards_at(step_ids).sum() == pytest.approx(random_episodes([10], seed=1)[0].reward.sum(), rel=1e-4)
-
-
-def test_pending_updates_are_one_for_each_step():
-    credit = small_assigner("rrdu", settings=SMALL_CREDIT)
-    add_episodes(credit, random_episodes([100] * 4))
-    credit.fit_pending()
-    n_first = credit.learner.n_updates
-    assert n_first == 256  # a long start makes no burst
-    add_episodes(credit, random_episodes([100] * 4, seed=1))
-    credit.fit_pending()
-    assert credit.learner.n_updates == n_first + 400
-
-
-def test_defaults_of_many_agents_remain():
-    spaces = {"observation_space": 2, "action_space": 1}
-    credit = CreditAssigner("rrdu", agents=3, max_steps=9, settings=CreditSettings(score="sum"), **spaces)
-    assert (credit.config.settings.steps, credit.config.settings.score) == (MULTI_AGENT_CREDIT.steps, "sum")
 
 
 def test_single_row_of_a_box_with_an_axis_of_one():

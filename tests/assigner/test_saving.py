@@ -88,6 +88,8 @@ def test_state_without_episodes_gives_the_same_rewards(is_pickled, tmp_path, phi
     numbers = again.add_episode(*new)
     assert numbers.tolist() == list(range(10))
     assert again.rewards_at(numbers).shape == (10,)
+    again.fit()  # it keeps what it learned from the other episodes
+    assert float(again.learner.decoder.closed_form.n_fitted) == (25 if is_pickled else 49)
 
 
 def test_save_replaces_an_earlier_save(tmp_path):

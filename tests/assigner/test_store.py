@@ -51,22 +51,6 @@ def test_store_matches_a_twin_that_stores_all_steps(moves, capacity):
             np.testing.assert_allclose(store.mean_reward[rows], score / len(steps), rtol=1e-6)
 
 
-def test_rows_and_add_refuse():
-    store = Store(5, (1,))
-    with pytest.raises(LareError, match="step 0 is not stored: no step is"):
-        store.rows(np.array([0]))
-    for _ in range(8):
-        store.add(1)
-    for steps, missing in [([8], 8), ([7, 2], 2), ([-1], -1)]:
-        with pytest.raises(LareError, match=f"step {missing} .* 3 to 7 .*capacity = 5"):
-            store.rows(np.array(steps))
-    assert store.rows(np.array([7, 3])).tolist() == [2, 3]
-    assert store.rows(np.zeros(0, np.int64)).tolist() == []
-    with pytest.raises(LareError, match=r"6 .*capacity = 5"):
-        store.add(6)
-    assert store.add(5).tolist() == [8, 9, 10, 11, 12]
-
-
 def test_lengths_of_a_running_episode_is_the_mean():
     store = Store(20, (3,))
     assert store.bytes_per_step == 36

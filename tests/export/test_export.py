@@ -8,7 +8,6 @@ import sys
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +28,6 @@ from lare_rl.data import replay
 from lare_rl.envs.interface import to_env_action
 from lare_rl.envs.load import read_task
 from lare_rl.export import export as export_module
-from lare_rl.export import exported as exported_module
 from lare_rl.export.policy_graph import policy_graph
 from lare_rl.latent.function import verify_function
 from lare_rl.phi.evaluate import evaluate
@@ -325,24 +323,6 @@ def test_invalid_inputs(export):
             call()
     r_hat = exported.reward(rows, np.zeros(1), rows)  # a single action for all steps
     np.testing.assert_array_equal(r_hat, exported.reward(rows, np.zeros((4, 1)), rows))
-
-
-@pytest.mark.parametrize("agents", [(), (1,)])
-def test_length_of_all_steps_can_be_a_number(monkeypatch, agents):
-    inputs = {
-        "before": {"shape": ["batch", *agents, 2], "type": "float32"},
-        "length": {"shape": ["batch", *agents], "type": "float32"},
-    }
-    entry = {"inputs": inputs, "outputs": {"r_hat": {"type": "float32"}}}
-    monkeypatch.setattr(exported_module, "_read_entry", lambda name: entry)
-    monkeypatch.setattr(exported_module, "_load_graph", lambda name: None)
-    evaluate_length = SimpleNamespace(evaluate=lambda graph, batch: {"r_hat": batch["length"]})
-    monkeypatch.setattr(exported_module, "_evaluate_module", lambda: evaluate_length)
-    function = exported_module.load.__wrapped__("reward")
-    np.testing.assert_array_equal(
-        function(before=np.zeros((3, *agents, 2)), length=7)["r_hat"], np.full((3, *agents), 7)
-    )
-    np.testing.assert_array_equal(function(before=np.zeros((*agents, 2)), length=7)["r_hat"], np.full(agents, 7))
 
 
 def test_trained_example_has_the_exported_programs():

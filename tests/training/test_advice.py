@@ -9,20 +9,16 @@ import lare_rl
 from helpers.toy_envs import pick_spec, toy_spec
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
-from lare_rl.new_task.draft import DEFAULT_LIMIT
 from lare_rl.runs.config_file import make_config
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import RETURN, RETURN_STD
-from lare_rl.tasks.spec import FILL_IN
 from lare_rl.training.advice import (
     MESSAGES,
     find_constant_returns,
     find_equal_returns,
     find_large_observations,
     find_saturated_policies,
-    find_slow_evaluations,
     find_untrained,
-    find_unwritten_texts,
 )
 from lare_rl.training.evaluation import N_STATES, greedy_actions, saturation
 from lare_rl.training.policy import get_actor
@@ -55,13 +51,11 @@ def test_large_observations(settings, factor, text, dense_run):
 
 def test_constant_returns():
     for returns, is_found in [
-        ([[7.5, 8.0]] * 4, False),
         ([[7.5, 8.0]] * 5, True),
         ([[7.5, 8.0]] * 6, False),  # it was reported before
         ([[7.5, 8.0]] * 6 + [[9.0, 8.0]] + [[7.5, 8.0]] * 5, True),
         ([[7.5, float(step)] for step in range(5)], False),
-        ([[0.0]] * 5, True),
-        ([[-7.5], [-7.5001], [-7.5], [-7.5], [-7.5]], True),
+        ([[np.nan]] * 5, False),
     ]:
         findings = find_constant_returns([np.array(per_seed) for per_seed in returns])
         assert [finding.code for finding in findings] == ["constant returns"] * is_found
@@ -72,10 +66,8 @@ def test_equal_returns(tmp_path):
     settings = resolve(Settings(method="dense", steps=100, evaluation_episodes=4), toy_spec())
     run, zero = Run(tmp_path, make_config(toy_spec(), settings, ()), ()), (0.0, 0.0)
     for values, is_found in (
-        ([zero] * 3, True),
         ([(7.1, 1e-9)] * 3, True),
         ([zero, zero, (0.0, 0.1)], False),
-        ([zero, zero, (1.0, 0.0)], False),
         ([zero, zero, (None, None)], False),
         ([zero, zero], False),
     ):
@@ -120,12 +112,10 @@ def test_greedy_actions_of_newest_states(dense_run):
     ("settings", "step", "loss", "expected"),
     [
         ({"td3": {"warmup": 60}}, 50, {}, ("steps so far random", {"step": 50, "warmup": 60})),
-        ({"td3": {"warmup": 60}}, 50, {"critic/loss": None}, ("steps so far random", {})),
         ({"td3": {"warmup": 50}}, 60, {}, ("steps so far random", {"step": 60, "warmup": 60})),  # whole iterations
         ({"td3": {"warmup": 60}}, 90, {"critic/loss": 0.0}, None),
         ({"algorithm": "qmix"}, 90, {}, ("too few episodes", {"step": 90, "algorithm": "qmix", "batch_size": 128})),
-        ({"algorithm": "qmix"}, 90, {"actor/objective": 2.0}, None),  # as a plugin names it
-        ({"algorithm": "qmix"}, 90, {"critic/loss": 2.0, "critic/loss_prey": None}, None),
+        ({"algorithm": "qmix"}, 90, {"actor/objective": 2.0, "critic/loss_prey": None}, None),  # as a plugin names it
     ],
 )
 def test_untrained_policy(settings, step, loss, expected, tmp_path):
@@ -141,21 +131,3 @@ def test_untrained_policy(settings, step, loss, expected, tmp_path):
         assert finding.code == expected[0]
         assert finding.values.items() >= expected[1].items()
         assert f"{step:,} steps" in render(finding, MESSAGES)
-
-
-def test_slow_evaluations():
-    settings = resolve(Settings(method="rrdu", evaluation_episodes=7), toy_spec())
-    (finding,) = find_slow_evaluations(settings, 40.0, 100.0)
-    assert finding.values == {"seconds": 40.0, "share": 0.4, "n_episodes": 7, "every": 5000}
-    assert not find_slow_evaluations(settings, 20.0, 100.0) + find_slow_evaluations(settings, 4.0, 5.0)
-
-
-def test_unwritten_texts():
-    task = toy_spec()
-    assert find_unwritten_texts(task) == []
-    draft = {"observation": f"4 entries.\n{FILL_IN}: what they mean", "action": FILL_IN}
-    for limit, is_guess in ((DEFAULT_LIMIT, True), (30, False)):
-        (finding,) = find_unwritten_texts(task.model_copy(update={**draft, "max_episode_steps": limit}))
-        text = render(finding, MESSAGES)
-        assert "observation, action" in text
-        assert (f"max_episode_steps = {DEFAULT_LIMIT}" in text) == is_guess

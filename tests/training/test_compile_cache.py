@@ -1,19 +1,15 @@
 """Functions that all runs of a process share."""
 
-import threading
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 
-from helpers.compilations import record_compilations
 from helpers.small_configs import small_config
 from helpers.toy_envs import PHI, toy_spec
 from lare_rl.latent.function import verify_function
 from lare_rl.training import compile_cache
 from lare_rl.training.compile_cache import cache_by_value, clear_compile_cache
-from lare_rl.training.compiled import compile_functions, init_seeds, learner_shape
-from lare_rl.training.streams import seed_keys
+from lare_rl.training.compiled import compile_functions
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,16 +48,3 @@ def test_run_shares_functions_but_not_phi():
     other_phi = compile_functions(small_config("lare-rrdu"), (other,))
     assert (other_phi.fit, other_phi.train_step) == (functions.fit, functions.train_step)
     assert other_phi.store is not functions.store
-
-
-def test_learning_is_compiled_while_steps_are_collected():
-    """A thread compiles it from shapes. The first call then compiles nothing."""
-    config = small_config("rd-linear")
-    functions = compile_functions(config)
-    thread = threading.Thread(target=functions.compile_learning, args=(learner_shape(config, 2),))
-    thread.start()
-    learner = init_seeds(functions, seed_keys(jnp.arange(2), 0))
-    thread.join()
-    with record_compilations() as compiled:
-        functions.learn_returns(learner)
-    assert compiled == []

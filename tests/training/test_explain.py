@@ -4,16 +4,12 @@ import jax
 import pytest
 
 import lare_rl
-from helpers.compilations import record_compilations
 from helpers.listeners import MessageListener
 from helpers.toy_envs import toy_spec
 from helpers.training_runs import train_quietly
 from lare_rl.credit.explanation_text import LEGEND_CODES, MESSAGES
 from lare_rl.latent.function import verify_function
-from lare_rl.training.compile_cache import clear_compile_cache
-from lare_rl.training.compiled import learner_shape
-from lare_rl.training.explain import compile_explanation, explain_run, explain_stored_returns
-from lare_rl.training.saved_state import load_learner
+from lare_rl.training.explain import explain_run
 
 SOURCE = "def evaluation_func(o, a):\n    return [o[:, 0:1] * a[:, 0:1], o[:, 1:2]]\n"
 SHARES = "of the variation of the returns of"
@@ -38,17 +34,6 @@ def check_explanation(run, messages):
 
 def test_explain_run(learned_training):
     check_explanation(*learned_training)
-
-
-def test_explanation_is_compiled_from_shapes(learned_training):
-    """As a thread does while steps are collected. The first explanation then compiles nothing."""
-    run, _ = learned_training
-    config, learner, _, _ = load_learner(run)
-    clear_compile_cache()
-    compile_explanation(learner_shape(config, len(run.seeds)), config)
-    with record_compilations() as compiled:
-        assert explain_stored_returns(learner, config)
-    assert compiled == []
 
 
 @pytest.mark.parametrize("method", ["lare-rd", "rrdu"])

@@ -3,7 +3,6 @@
 import threading
 import time
 
-import numpy as np
 import pytest
 
 from helpers.listeners import MessageListener
@@ -13,7 +12,6 @@ from lare_rl.config.settings import Settings
 from lare_rl.errors import LareError
 from lare_rl.runs.config_file import make_config
 from lare_rl.runs.directory import Run
-from lare_rl.training import advice
 from lare_rl.training import session as sessions
 from lare_rl.training import train as training
 from lare_rl.training.decoder_fits import FirstFitStoppedError
@@ -73,29 +71,12 @@ def test_time_of_an_evaluation_has_no_checkpoint_in_it(seconds, is_slow, tmp_pat
     assert any("--evaluation-episodes" in message for message in listener.messages) == is_slow
 
 
-def test_return_that_is_not_a_number_is_no_constant_return(tmp_path, monkeypatch):
-    monkeypatch.setattr(advice, "N_EQUAL_EVALUATIONS", 2)
-    listener, session = Recorder(), EmptySession(tmp_path)
-    session.evaluate = lambda rate: [{"step": session.step, "seed": 0, "evaluation/return": None, "critic/loss": 1.0}]
-    training.run_session(session, [listener], threading.Event())
-    assert not any("same return" in message for message in listener.messages)
-
-
 def test_first_fit_that_is_stopped_is_not_kept(tmp_path):
     def stop(until):
         raise FirstFitStoppedError
 
     with pytest.raises(training.RunInterruptedError, match=r"nothing is kept.*--resume"):
         training.run_session(EmptySession(tmp_path, advance=stop), [], threading.Event())
-
-
-def test_steps_are_passed_on_at_most_once_a_second(monkeypatch):
-    now, steps = iter(np.arange(0.0, 5, 0.3)), []
-    monkeypatch.setattr(time, "monotonic", lambda: float(next(now)))
-    call = training._limit_rate(steps.append)
-    for step in range(6):
-        call(step)
-    assert steps == [3]
 
 
 def test_every_listener_is_stopped(tmp_path, monkeypatch):

@@ -46,12 +46,6 @@ def episodes():
 
 
 @pytest.mark.long
-def test_r2_of_unseen_returns(episodes):
-    assert 0.99 < assess(RIGHT, episodes).r2 <= 1
-    assert assess(WRONG, episodes).r2 < 0.3
-
-
-@pytest.mark.long
 def test_assessment_describes_factors(episodes):
     right = assess(RIGHT, episodes)
     assert right.ranges[0].startswith("- f_0: from ")
@@ -106,20 +100,6 @@ def test_no_model_is_asked_without_a_reason(episodes):
         assert text in messages[0]
 
 
-def test_directory_of_a_run(dense_run):
-    messages = []
-    function = reflect(
-        verify_function(WRONG, TASK), TASK, ScriptedModel(), episodes=dense_run.directory, on_message=messages.append
-    )
-    assert function.source == WRONG
-    assert "6 episodes" in messages[0]
-
-
-def test_function_may_be_the_model(episodes):
-    function = reflect(verify_function(WRONG, TASK), TASK, lambda messages: to_reply(RIGHT), episodes=episodes)
-    assert function.source == RIGHT
-
-
 def test_better_function_is_kept(episodes):
     messages, model = [], ScriptedModel(WRONG, RIGHT, CONSTANT)
     function = design_and_reflect(model, 2, messages=messages)
@@ -131,14 +111,6 @@ def test_better_function_is_kept(episodes):
     assessment = assess(WRONG, episodes)
     evidence = "\n".join([*assessment.ranges, *assessment.sentences])
     assert model.requests[1] == prompts.reflect(TASK, to_reply(WRONG), evidence)
-
-
-@pytest.mark.long
-def test_episodes_of_policy():
-    model = ScriptedModel(WRONG, RIGHT)
-    design_and_reflect(model, 1, policy=lambda observation: 0.5 * observation[:1])
-    episodes = play_episodes(TASK, N_EPISODES, lambda observation: 0.5 * observation[:1])
-    assert assess(WRONG, episodes).ranges[0] in model.requests[1][-1]["content"]
 
 
 @pytest.mark.long

@@ -1,7 +1,6 @@
 """Runs that are killed, stopped, extended or damaged, and then resumed: exact, or refused."""
 
 import errno
-import json
 import os
 import shutil
 import signal
@@ -15,7 +14,6 @@ import pytest
 import lare_rl
 from helpers.jax_toy_envs import echo_spec
 from helpers.listeners import AtStep, MessageListener, metrics_without_times
-from helpers.long_tests import long_case
 from helpers.toy_envs import toy_spec
 from helpers.training_runs import (
     CHASE,
@@ -102,16 +100,6 @@ def test_resume_after_signal_is_exact(dense, dense_run, tmp_path):
     assert not (dense_run.checkpoint / "rows-1.npz").exists()
 
 
-@pytest.mark.long
-def test_resume_many_agents_on_device_is_exact(echo_settings, echo_run, tmp_path):
-    """In the middle of episodes, after a signal; and between two checkpoints, after an error."""
-    function = verify_function(ECHO_PHI, echo_spec())
-    train_and_stop(echo_spec(), echo_settings, tmp_path / "run", 40, function)
-    with pytest.raises(ZeroDivisionError):
-        resume_quietly(tmp_path / "run", listeners=[AtStep(60, lambda: 1 / 0)])
-    assert_equal_runs(resume_quietly(tmp_path / "run"), echo_run)
-
-
 HALF_EPISODES = {"rollout_steps": 10, "steps": 400, "evaluate_every": 80}
 
 
@@ -124,6 +112,7 @@ HALF_EPISODES = {"rollout_steps": 10, "steps": 400, "evaluate_every": 80}
         ("small_many", HOSTED_ECHO, {"algorithm": "qmix", "method": "rrdu"} | HALF_EPISODES, 80),
         ("small", IN_WORKERS, {"algorithm": "ppo", "method": "rrdu", "environments": 2, "evaluate_every": 72}, 72),
         ("small", toy_spec(), {"algorithm": "sac", "method": "lare-rrdu"}, 156),
+        ("small", toy_spec(), {"scored_observation": "both", "overlap_collection": True}, 156),
     ],
 )
 def test_resume_is_exact(build, task, changes, stop, phi, request, tmp_path):
@@ -133,16 +122,6 @@ def test_resume_is_exact(build, task, changes, stop, phi, request, tmp_path):
     expected = train_quietly(task, settings, tmp_path / "complete", function)
     train_and_stop(task, settings, tmp_path / "run", stop, function)
     assert_equal_runs(resume_quietly(tmp_path / "run"), expected)
-
-
-@pytest.mark.long
-def test_overlapped_collection_resumes_exactly(small, phi, tmp_path):
-    settings = small(scored_observation="both", overlap_collection=True)  # compiled as `factor_run`
-    expected = train_quietly(toy_spec(), settings, tmp_path / "complete", phi)
-    train_and_stop(toy_spec(), settings, tmp_path / "run", 156, phi)
-    assert_equal_runs(resume_quietly(tmp_path / "run"), expected)
-    with pytest.raises(LareError, match="overlap_collection"):
-        train_quietly(toy_spec(), small(algorithm="ppo", overlap_collection=True), tmp_path / "refused", phi)
 
 
 def test_finished_run_and_missing_files(dense_run, tmp_path):
@@ -180,21 +159,6 @@ def test_extend_equals_longer_run(dense, dense_run, tmp_path, monkeypatch):
     assert len(list(run.directory.glob("tensorboard/seed-*/events*"))) == 4
     assert longer.config.ended_at == (120,)
     assert open_run(run.directory).config == longer.config
-
-
-@pytest.mark.parametrize("anneal", [long_case(True), long_case(False)])
-def test_extending_a_run_whose_learning_rate_fell_is_no_long_run(small, tmp_path, anneal):
-    """Steps are rounded up, and a message says so."""
-    ppo = {"hidden": (8,), "minibatch_size": 20, "epochs": 1, "anneal": anneal}
-    settings = small(method="dense", algorithm="ppo", steps=40, rollout_steps=20, evaluate_every=20, ppo=ppo)
-    run = train_quietly(CHASE, settings, tmp_path / "run")
-    listener = AtStep(0, lambda: None)
-    lare_rl.resume(run, steps=70, listeners=[listener])
-    with pytest.raises(LareError, match="planned for 80"):
-        resume_quietly(run, steps=60)  # `run` was opened before it was extended
-    assert open_run(run.directory).config.settings.steps == 80
-    assert sum("steps = 70 is rounded up to 80" in message for message in listener.messages) == 1
-    assert sum(all(text in message for text in ("ppo.anneal", "0%", "50%")) for message in listener.messages) == anneal
 
 
 def test_dropped_episodes(dense, tmp_path):
@@ -238,20 +202,6 @@ def test_checkpoint_of_other_environments_is_refused(dense_run, tmp_path):
         change_state(run, change_collector)
         with pytest.raises(LareError, match="does not fit its environments"):
             resume_quietly(run)
-
-
-def test_other_version_is_named(dense_run, tmp_path):
-    run = copy_run(dense_run, tmp_path / "run")
-    config = json.loads((run.directory / "config.json").read_text())
-    (run.directory / "config.json").write_text(json.dumps(config | {"lare": "0.1.0"}))
-
-    def cut_weight(arrays):
-        name = next(name for name in arrays if name.startswith(".algorithm") and arrays[name].ndim > 1)
-        arrays[name] = arrays[name][..., :-1]
-
-    change_state(run, cut_weight)
-    with pytest.raises(LareError, match=r"has shape .* the run is of LaRe 0\.1\.0, and this is LaRe "):
-        resume_quietly(run.directory)
 
 
 def test_best_policy_is_saved(dense_run):

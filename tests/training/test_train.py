@@ -5,7 +5,6 @@ import re
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import gymnasium
-import jax
 import numpy as np
 import pytest
 
@@ -24,7 +23,6 @@ from lare_rl.latent.function import verify_function
 from lare_rl.runs.checkpoint import read_metadata
 from lare_rl.runs.directory import open_run
 from lare_rl.runs.metric_names import ACTOR_SATURATION
-from lare_rl.training import train as training
 from lare_rl.training.collect_host import HostCollector
 from lare_rl.training.divergence import DivergedError
 from lare_rl.training.latent_functions import choose_functions
@@ -180,17 +178,6 @@ def test_close_reports_a_failed_checkpoint_after_an_error_of_the_environments(mo
     assert isinstance(error.value.__context__, RuntimeError)
     with pytest.raises(RuntimeError, match="shutdown"):
         threads.submit(print)
-
-
-def test_full_memory_is_reported(small, tmp_path, monkeypatch):
-    for i, error in enumerate([MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")]):
-
-        def fail(run, error=error):
-            raise error
-
-        monkeypatch.setattr(training, "start_session", fail)
-        with pytest.raises(LareError, match="memory is full: 2 seeds with a replay of 482 rows each"):
-            train_quietly(toy_spec(), small(method="dense"), tmp_path / f"run-{i}")
 
 
 # Toys that must be learned.

@@ -12,7 +12,7 @@ from lare_rl.phi.arrays import Array, as_array
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import Graph, NumberKind, all_positions
 from lare_rl.phi.numpy_functions import FUNCTIONS, call_numpy
-from lare_rl.training.numpy_program import Operation, UnsupportedOperationError, apply
+from lare_rl.training.numpy_program import Operation, UnsupportedOperationError, to_numpy
 
 __all__ = ["add_function", "finish", "graph_input"]
 
@@ -38,7 +38,7 @@ def add_function(function: Callable[[dict[str, Any]], Any], arrays: dict[str, Ar
     """
     shapes = {name: jax.ShapeDtypeStruct(array.row_shape, JAX_DTYPES[array.kind]) for name, array in arrays.items()}
     try:
-        return apply(function, shapes, arrays, _find_function)
+        return to_numpy(function, shapes, array_functions=_find_function)(arrays)()
     except UnsupportedOperationError as error:
         raise LareError(
             f"a function of this run cannot be exported, because its operation {str(error)!r} is not translated: load the policy in "

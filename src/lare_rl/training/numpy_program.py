@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
-__all__ = ["UnsupportedOperationError", "apply", "to_numpy"]
+__all__ = ["UnsupportedOperationError", "to_numpy"]
 
 Operation = Callable[..., Any]
 ArrayFunctions = Callable[[str], Operation]
@@ -35,22 +35,27 @@ class _Call(NamedTuple):
     result: int
 
 
-def to_numpy(function: Callable[..., Any], fixed: Any, *shapes: Any) -> Callable[[Any], Callable[..., Any]]:
+def to_numpy(
+    function: Callable[..., Any], fixed: Any, *shapes: Any, array_functions: ArrayFunctions | None = None
+) -> Callable[[Any], Callable[..., Any]]:
     """Translate a function whose first argument stays the same for many calls, such as the weights of a policy.
 
     Args:
         function: a function of pytrees of arrays, without random numbers and loops.
         fixed: its first argument, or the shapes of its arrays.
         shapes: its other arguments, or their shapes.
+        array_functions: the functions of the library of the arrays; by default, those of NumPy.
 
     Returns:
-        A function from the first argument, as NumPy arrays, to a function of the other arguments. What depends on the first argument
-        alone is computed once.
+        A function from the first argument, as arrays of that library, to a function of the other arguments. What depends on the first
+        argument alone is computed once.
 
     Raises:
         UnsupportedOperationError: the function has an operation that is not translated.
     """
-    arguments, registers, calls, results, structure = _trace(function, (fixed, *shapes), _numpy_function)
+    arguments, registers, calls, results, structure = _trace(
+        function, (fixed, *shapes), array_functions or _numpy_function
+    )
     n_fixed = len(jax.tree.leaves(fixed))
     once, each_time = _split_calls(calls, arguments[n_fixed:])
 
@@ -68,25 +73,6 @@ def to_numpy(function: Callable[..., Any], fixed: Any, *shapes: Any) -> Callable
         return run
 
     return bind
-
-
-def apply(function: Callable[..., Any], shapes: Any, values: Any, array_functions: ArrayFunctions) -> Any:
-    """Call a function of JAX with arrays of another library.
-
-    Args:
-        function: a function of one pytree of arrays, as for `to_numpy`.
-        shapes: the argument with the shape and type of each array instead of the array.
-        values: the argument with arrays of the other library.
-        array_functions: the functions of that library.
-
-    Raises:
-        UnsupportedOperationError: the function has an operation that is not translated.
-    """
-    _, registers, calls, results, structure = _trace(function, (shapes,), array_functions)
-    leaves = jax.tree.leaves(values)
-    registers[: len(leaves)] = leaves
-    _run(calls, registers)
-    return jax.tree.unflatten(structure, [registers[i] for i in results])
 
 
 def _trace(
