@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from pydantic import Field, InstanceOf
 
 from lare_rl.assigner.space_layout import SpaceLayout, make_layout
-from lare_rl.config.validity import check_credit, check_factors
+from lare_rl.config.validity import check_credit, check_phi
 from lare_rl.credit.decoder_settings import CreditSettings, resolve_credit
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.input_names import input_arrays
@@ -184,20 +184,11 @@ def check_config(config: AssignerConfig) -> None:
     method, phi, name = config.method, config.phi, config.method.name
     if not method.has_proxy_rewards:
         raise LareError(f"{name} assigns no credit: train on what the environment pays")
-    if phi is None:
-        if method.needs_phi:
-            raise LareError(f"{name} needs a phi; bayes, rd and rrdu need none")
-    elif not method.needs_phi:
-        raise LareError(f"{name} needs no phi: leave it out, or use lare-bayes")
-    elif method.phi_kind != "reward" and phi.kind != method.phi_kind:
-        # A reward that was written by hand does not name its kind.
-        raise LareError(f"{name} needs a phi of the kind {method.phi_kind!r}, and this one is of the kind {phi.kind!r}")
-    elif config.task is None:
-        raise LareError("a phi needs the task that it was designed for: CreditAssigner(..., phi, task=task)")
-    else:
+    if phi is not None and method.needs_phi:
+        if config.task is None:
+            raise LareError("a phi needs the task that it was designed for: CreditAssigner(..., phi, task=task)")
         check_task(phi, config.task)
     check_credit(config.spec, config.agents)
-    if phi is not None:
-        check_factors(method, phi.n_factors(config.scored_observation))
+    check_phi(method, phi, config.scored_observation)
     if config.agents > 1 and config.max_steps is None and method.uses_gradient:
         raise LareError(f"{name} of many agents needs max_steps, the number of steps of the longest episode")

@@ -12,8 +12,10 @@ from lare_rl.credit.closed_form import MAX_SIGNED_FACTORS
 from lare_rl.credit.methods import Fit, Method, Reward
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.errors import LareError
+from lare_rl.latent.function import LatentFunction
+from lare_rl.tasks.spec import ScoredObservation
 
-__all__ = ["check_credit", "check_factors", "check_training"]
+__all__ = ["check_credit", "check_phi", "check_training"]
 
 
 def check_credit(spec: CreditSpec, n_agents: int, *, discrete_actions: bool = True) -> None:
@@ -83,14 +85,23 @@ def check_training(config: CreditConfig) -> None:
         )
 
 
-def check_factors(method: Method, n_factors: int) -> None:
-    """Raise `LareError` if a method cannot use a function with this number of factors."""
+def check_phi(method: Method, phi: LatentFunction | None, scored_observation: ScoredObservation) -> None:
+    """Raise `LareError` if a method cannot use a latent function, or if it needs one and there is none."""
+    name = method.name
+    if phi is None:
+        if method.needs_phi:
+            raise LareError(f"{name} needs a phi; bayes, rd and rrdu need none")
+        return
+    if not method.needs_phi:
+        raise LareError(f"{name} needs no phi: leave it out, or use lare-bayes")
+    if method.phi_kind != "reward" and phi.kind != method.phi_kind:
+        # A reward that was written by hand does not name its kind.
+        raise LareError(f"{name} needs a phi of the kind {method.phi_kind!r}, and this one is of the kind {phi.kind!r}")
+    n_factors = phi.n_factors(scored_observation)
     if method.reward is Reward.DESIGNED and n_factors != 1:
         raise LareError(
-            f"{method.name} needs a function with one array, the reward, and this one has {n_factors}: "
+            f"{name} needs a function with one array, the reward, and this one has {n_factors}: "
             "lare-rl design TASK --kind reward writes one"
         )
     if method.fit is Fit.SIGNS and n_factors > MAX_SIGNED_FACTORS:
-        raise LareError(
-            f"{method.name} tries all signs of at most {MAX_SIGNED_FACTORS} factors, and there are {n_factors}"
-        )
+        raise LareError(f"{name} tries all signs of at most {MAX_SIGNED_FACTORS} factors, and there are {n_factors}")

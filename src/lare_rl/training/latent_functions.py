@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 
 from lare_rl.config.settings import ResolvedSettings
-from lare_rl.config.validity import check_factors
+from lare_rl.config.validity import check_phi
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.design import design
@@ -49,7 +49,7 @@ def choose_functions(
         pairs = pair_with_roles([function] if isinstance(function, FunctionOrPath) else function, task)
         functions = [_load_function(function, role) for function, role in pairs]
     for function in functions:
-        check_factors(method, function.n_factors(settings.choose_scored_observation(task)))
+        check_phi(method, function, settings.choose_scored_observation(task))
     return tuple(functions)
 
 

@@ -22,9 +22,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.algorithms.registry import Consumes
 from lare_rl.config.train_config import CreditConfig
-from lare_rl.config.validity import check_training
+from lare_rl.config.validity import check_phi, check_training
 from lare_rl.credit.decoder_settings import CreditSettings, resolve_credit
-from lare_rl.credit.methods import METHODS, Method, Reward
+from lare_rl.credit.methods import METHODS, Reward
 from lare_rl.data.replay import StoredSteps, mean_length, required_capacity, segments_as_episodes
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, to_env_action
@@ -132,7 +132,13 @@ def pure_credit(
     if not isinstance(settings, CreditSettings | None):
         raise LareError(f"settings must be a lare_rl.CreditSettings, and are {short_repr(settings)}")
     chosen, credit = METHODS.find(method), resolve_credit(settings, agents)
-    phi = _check_phi(chosen, phi, (observation_size, action_size))
+    if not isinstance(phi, LatentFunction | None):
+        raise LareError(f"phi must come from lare_rl.design or lare_rl.load_function, and is {short_repr(phi)}")
+    if phi is not None and tuple(phi.sizes) != (observation_size, action_size):
+        raise LareError(
+            f"phi reads observations and actions of the sizes {phi.sizes[0]} and {phi.sizes[1]}, not {observation_size} and {action_size}"
+        )
+    check_phi(chosen, phi, scored_observation)
     env = EnvSpec(
         teams=(Team("agent", 0, agents),),
         observation_size=observation_size,
@@ -160,19 +166,6 @@ def pure_credit(
     _check_steps(config)
     check_training(config)
     return _make_functions(config, () if phi is None else (phi.graph,))
-
-
-def _check_phi(method: Method, phi: LatentFunction | None, sizes: tuple[int, int]) -> LatentFunction | None:
-    """Return the function, or None if the method does not read it. Raises `LareError` if it does not fit, or is missing."""
-    if not isinstance(phi, LatentFunction | None):
-        raise LareError(f"phi must come from lare_rl.design or lare_rl.load_function, and is {short_repr(phi)}")
-    if phi is not None and tuple(phi.sizes) != sizes:
-        raise LareError(
-            f"phi reads observations and actions of the sizes {phi.sizes[0]} and {phi.sizes[1]}, not {sizes[0]} and {sizes[1]}"
-        )
-    if method.needs_phi and phi is None:
-        raise LareError(f"{method.name} needs a latent function: phi=...")
-    return phi if method.needs_phi else None
 
 
 def _read_bounds(name: str, bounds: Any, shape: tuple[int, int]) -> Float[np.ndarray, "agents action"]:
