@@ -268,11 +268,9 @@ def test_from_training_to_report(command, spec_file, phi):
     assert (status, out) == (2, "")
     assert "film.avi" in err
 
-    # A finished run is not trained again. A page that was watched is updated.
-    (run / "watch.html").write_text("stale")
+    # A finished run is not trained again.
     status, out, _ = command("train", "--resume", run)
     assert status == 0
-    assert "Step 200 of 200; not running" in (run / "watch.html").read_text(encoding="utf-8")
     assert out.endswith(f"finished {run}; to see it: lare-rl report {run}\n")
     assert (run / "metrics.jsonl").read_bytes() == metrics
 

@@ -2,7 +2,6 @@ import os
 import re
 import shutil
 import subprocess
-import webbrowser
 from pathlib import Path
 
 import gymnasium
@@ -17,8 +16,6 @@ from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
 from lare_rl.envs.load import load_task
 from lare_rl.evaluation.video import encode_film
-from lare_rl.report import live_page
-from lare_rl.report.live_page import LivePage
 from lare_rl.report.messages import MESSAGES
 from lare_rl.report.overview import render_learning_curves, summarise_runs
 from lare_rl.report.report import _load_film, default_path
@@ -213,29 +210,6 @@ def test_unknown_step_rewards(pages):
         assert all(text in page for page in pages)
     assert "credit can be trusted" in pages[1] or "Trust the credit in part" in pages[1]
     assert "The score was taken as" not in pages[1]  # of equal lengths
-
-
-def test_live_page(make_run, monkeypatch):
-    opened = []
-    monkeypatch.setattr(webbrowser, "open", opened.append)
-    played = []
-    monkeypatch.setattr(live_page, "measure_random_returns", lambda task: played.append(task) or np.zeros((1, 2)))
-    run, trained = make_run("a", [1.0], steps=()), make_run("b", [2.0])
-    path, page = run.directory / "watch.html", LivePage(run.directory)
-    page.on_stop()
-    assert not path.exists()
-    page.on_start("a", 0, 100)
-    assert opened == [path.resolve().as_uri()]
-    assert "Step 0 of 100" in path.read_text()
-    assert played == []  # training begins first
-    shutil.copy(trained.directory / "metrics.jsonl", run.directory)
-    page.on_evaluation([])
-    for text in ('<meta http-equiv="refresh" content="10">', "Step 100 of 100", "<svg", 'class="headline"'):
-        assert text in path.read_text()
-    page.on_evaluation([])
-    assert len(played) == 1
-    page.on_stop()
-    assert "refresh" not in path.read_text()
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")

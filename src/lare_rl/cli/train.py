@@ -45,7 +45,6 @@ def train(
     tensorboard: bool = False,
     wandb: Annotated[str | None, tyro.conf.arg(metavar="PROJECT")] = None,
     mlflow: Annotated[str | None, tyro.conf.arg(metavar="EXPERIMENT")] = None,
-    watch: bool = False,
 ) -> None:
     """Train on a task's episodic rewards. Ctrl-C saves and stops; --resume continues.
 
@@ -63,7 +62,6 @@ def train(
         tensorboard: write TensorBoard events into the run directory too (needs the extra lare-rl[tensorboard]).
         wandb: send the metrics of each seed to a project of Weights & Biases too (needs the extra lare-rl[wandb]).
         mlflow: send the metrics of each seed to an experiment of MLflow too (needs the extra lare-rl[mlflow]).
-        watch: write verdict and curves to watch.html in the run directory after every evaluation, and open it in the browser.
     """
     plan = config or RunPlan()
     chosen_task = task or plan.task
@@ -82,7 +80,7 @@ def train(
                 "--out, --config and all settings but --steps"
             )
         stopped = open_run(resume)
-        directory, run_settings = resume, stopped.config.settings
+        run_settings = stopped.config.settings
         start = partial(lare_rl.resume, stopped, steps=settings.steps)
     elif chosen_task is None:
         raise LareError(
@@ -90,9 +88,8 @@ def train(
             "or lare-rl train --resume DIR"
         )
     else:
-        start, directory, run_settings = _prepare(chosen_task, settings, function, out or plan.out, plan)
-    listeners = [*_listeners(wandb, mlflow, run_settings), *_live_page(directory, watch)]
-    run = start(tensorboard=tensorboard, listeners=listeners)
+        start, run_settings = _prepare(chosen_task, settings, function, out or plan.out, plan)
+    run = start(tensorboard=tensorboard, listeners=_listeners(wandb, mlflow, run_settings))
     module = module_to_trust(run.config.task)
     trust = f"{TRUST_VARIABLE}={module} " if module else ""
     print_line(f"finished {run.directory}; to see it: {trust}lare-rl report {shlex.quote(str(run.directory))}")
@@ -100,8 +97,8 @@ def train(
 
 def _prepare(
     task: "str | TaskSpec", settings: Settings, function: Sequence[Path], out: Path | None, plan: RunPlan
-) -> "tuple[Callable[..., Run], Path, ResolvedSettings]":
-    """Return the function that starts a new run, its directory, and its settings."""
+) -> "tuple[Callable[..., Run], ResolvedSettings]":
+    """Return the function that starts a new run, and its settings."""
     import lare_rl
     from lare_rl.config.resolve import resolve
     from lare_rl.envs.load import resolve_task
@@ -116,7 +113,7 @@ def _prepare(
     files = function or plan.function_for(resolved)
     functions = _load_functions(files, spec, resolved) if files else None
     out = out or default_directory(spec, resolved)
-    return partial(lare_rl.train, spec, settings, function=functions, out=out), out, resolved
+    return partial(lare_rl.train, spec, settings, function=functions, out=out), resolved
 
 
 def _load_functions(
@@ -146,24 +143,3 @@ def _listeners(wandb: str | None, mlflow: str | None, settings: ResolvedSettings
     if mlflow is not None:
         listeners.append(MLflow(mlflow, parameters=values))
     return listeners
-
-
-def _live_page(directory: Path, watch: bool) -> "list[Listener]":
-    """Return a list with the page that shows the run, or an empty list.
-
-    The page is written if `watch` is true, or if the directory already has one.
-    """
-    from lare_rl.runs.directory import LIVE_PAGE
-
-    page = directory / LIVE_PAGE
-    if not watch and not page.exists():
-        return []
-    try:
-        from lare_rl.report.live_page import LivePage
-    except LareError:
-        if watch:
-            raise
-        return []  # an old page is no reason to ask for the extra
-    if watch:
-        print_progress(f"to watch it: {page}")
-    return [LivePage(directory, browser=watch)]

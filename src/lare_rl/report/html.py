@@ -20,7 +20,7 @@ _PAGE = """<!doctype html>
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-{refresh}<title>{title}</title>
+<title>{title}</title>
 <style>
 {style}</style>
 </head>
@@ -31,14 +31,13 @@ _PAGE = """<!doctype html>
 """
 
 
-def write_page(path: Path, title: str, body: str, refresh: int | None = None) -> Path:
-    """Write a self-contained HTML file, and return its path. A browser reloads it after `refresh` seconds.
+def write_page(path: Path, title: str, body: str) -> Path:
+    """Write a self-contained HTML file, and return its path.
 
     Raises `LareError` if the file cannot be written. An older file is left unchanged.
     """
-    reload = "" if refresh is None else f'<meta http-equiv="refresh" content="{refresh}">\n'
     style = (files("lare_rl.report") / "report.css").read_text(encoding="utf-8")
-    page = _PAGE.format(title=escape(title), style=style, body=body, refresh=reload)
+    page = _PAGE.format(title=escape(title), style=style, body=body)
     write_bytes(path, page.encode(errors="backslashreplace"))  # a name in the file system need not be UTF-8
     return path
 

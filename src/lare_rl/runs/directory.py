@@ -5,7 +5,6 @@ latent_function.py   phi; its replies and checks are in latent_function.json. Se
 metrics.jsonl        see metrics_file.py
 checkpoint/          see checkpoint.py
 failed_batch.npz     the input of the latent function, if it failed
-watch.html           a page that shows the run while it trains, if that was asked for
 """
 
 import contextlib
@@ -30,7 +29,6 @@ from lare_rl.util.processes import try_lock
 
 __all__ = [
     "CHECKPOINT",
-    "LIVE_PAGE",
     "Run",
     "RunBusyError",
     "as_run",
@@ -46,8 +44,6 @@ __all__ = [
 ]
 
 CHECKPOINT = "checkpoint"
-LIVE_PAGE = "watch.html"
-"""The page of `lare-rl train --watch`."""
 
 
 class RunBusyError(LareError):
