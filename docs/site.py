@@ -30,7 +30,7 @@ def on_files(files: Files, config: Any) -> Files:
     pages = {
         "index.md": move_links((ROOT / "README.md").read_text(encoding="utf-8")),
         "changelog.md": move_links((ROOT / "CHANGELOG.md").read_text(encoding="utf-8")),
-        "reference/python.md": python_reference(lare_rl.SOURCES),
+        "reference/python.md": python_reference(lare_rl.PUBLIC_NAMES),
         "reference/command-line.md": command_line_reference(COMMANDS),
     }
     for name, text in pages.items():

@@ -32,8 +32,8 @@ def find_imports(module: str) -> set[str]:
             case ast.ImportFrom():
                 assert node.level == 0, f"{module} has a relative import, which this test does not follow"
                 names |= {f"{node.module}.{alias.name}" for alias in node.names}
-            case ast.Attribute(value=ast.Name(id="lare_rl"), attr=name) if name in lare_rl.SOURCES:
-                names.add(".".join(lare_rl.SOURCES[name]))
+            case ast.Attribute(value=ast.Name(id="lare_rl"), attr=name) if name in lare_rl.PUBLIC_NAMES:
+                names.add(".".join(lare_rl.PUBLIC_NAMES[name]))
     return {name for name in names if name.startswith("lare_rl.")}
 
 

@@ -1,4 +1,4 @@
-"""LaRe: train reinforcement learning on episodic rewards, through latent rewards that a language model wrote.
+"""LaRe: a reward for every step, from one number per episode.
 
 task = lare_rl.load_task("HalfCheetah-v4")
 phi = lare_rl.design(task)
@@ -43,22 +43,24 @@ if TYPE_CHECKING:
     from lare_rl.turns.credit import TurnCredit as TurnCredit
 
 
-def _read_sources() -> dict[str, tuple[str, str]]:
-    """Return the module of each public name, and its name there, from the imports above, which only type checkers execute."""
+def _read_public_names() -> dict[str, tuple[str, str]]:
+    """Return the public names, which are those that the block above imports. Only type checkers execute it."""
     tree = ast.parse(Path(__file__).read_text(encoding="utf-8"))
-    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    return {alias.asname: (str(node.module), alias.name) for node in imports for alias in node.names if alias.asname}
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
+    return {alias.asname or alias.name: (str(node.module), alias.name) for node in imports for alias in node.names}
 
 
-SOURCES = _read_sources()
-__all__ = ["__version__", *SOURCES]  # pyright: ignore[reportUnsupportedDunderAll]
+PUBLIC_NAMES = _read_public_names()
+"""The module of each public name, and its name there."""
+__all__ = ["__version__", *PUBLIC_NAMES]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in SOURCES:
+    if name not in PUBLIC_NAMES:
         raise AttributeError(f"module 'lare_rl' has no attribute {name!r}")
-    module, source_name = SOURCES[name]
-    return getattr(import_module(module), source_name)
+    module, name_there = PUBLIC_NAMES[name]
+    return getattr(import_module(module), name_there)
 
 
 def __dir__() -> list[str]:

@@ -110,7 +110,10 @@ def test_bad_data_sets(datasets):
 
 
 def test_draft_of_task(command, tmp_path):
-    description = "A walker of two legs. Its reward is its speed. It must not fall."
+    description = (
+        "A walker of two legs. Its reward is its speed. It must not fall.\n## Observation Space\nEntry 0 is the angle.\n"
+        "## Rewards\n- 1 for each metre\n"
+    )
     create_dataset("walks/log-v0", logged_episodes(3), description=description)
     status, out, error = command("new-task", "walks/log-v0", "--out", "task.toml")
     assert (status, error) == (0, "")
@@ -120,4 +123,6 @@ def test_draft_of_task(command, tmp_path):
     (tmp_path / "task.toml").write_text(text)
     task = lare_rl.load_task("task.toml")
     assert "speed" not in task.description
+    assert "metre" not in text.split("not used: rewards.", 1)[1]
+    assert task.observation == "2 entries.\nEntry 0 is the angle."
     assert (task.name, task.environment, task.observation_size, task.action_size) == ("log-v0", "none", 2, 1)

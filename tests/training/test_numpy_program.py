@@ -26,6 +26,7 @@ def draw(*shape):
         (jax.vmap(lambda w, x: jax.nn.relu(x @ w)), (draw(2, 4, 3), draw(2, 5, 4))),
         (lambda w, x: jnp.einsum("ij,kj->ik", w, x), (draw(4, 3), draw(5, 3))),
         (lambda w, x: jnp.einsum("bij,bkjl->bkil", w, x), (draw(2, 4, 3), draw(2, 5, 3, 2))),
+        (lambda w, x: jnp.einsum("ij,kj->ik", w, x), (draw(5, 0), draw(4, 0))),
         (lambda w, x: jnp.concatenate(jnp.split(x + w, 3, axis=-1)[::-1], axis=-1), (draw(6), draw(5, 6))),
         (lambda w, x: jnp.where(x > w, x, w)[:, 1:3], (draw(4), draw(5, 4))),
         (lambda w, x: jax.nn.one_hot(jnp.argmax(x * w, axis=-1), 4), (draw(4), draw(5, 4))),
@@ -43,10 +44,25 @@ def test_program_equals_function(function, arguments):
     assert jax.tree.map(lambda x: (x.shape, x.dtype), actual) == jax.tree.map(lambda x: (x.shape, x.dtype), expected)
 
 
-@pytest.mark.parametrize("function", [lambda w, x: jnp.sort(x + w), lambda w, x: jax.lax.fori_loop(0, 3, jnp.add, x)])
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda w, x: jnp.sort(x + w),
+        lambda w, x: jax.lax.fori_loop(0, 3, jnp.add, x),
+        lambda w, x: jnp.bitwise_or.reduce(x.astype(int)),
+        lambda w, x: jax.lax.div(x.astype(int), w.astype(int)),
+        lambda w, x: jnp.dot(x.astype(jnp.int8), w.astype(jnp.int8), preferred_element_type=jnp.int32),
+    ],
+)
 def test_other_operations_are_refused(function):
     with pytest.raises(UnsupportedOperationError):
         to_numpy(function, draw(4), draw(4))
+
+
+def test_other_arguments_are_refused():
+    program = to_numpy(lambda w, x: w * x, draw(4), draw(4))(draw(4))
+    with pytest.raises(TypeError, match="arguments"):
+        program(draw(4), draw(4))
 
 
 @pytest.mark.parametrize("algorithm", ["td3", "sac", "ppo"])

@@ -24,7 +24,7 @@ from lare_rl.util import compilation
 from lare_rl.util.provenance import code_version
 
 DESCRIPTION = (
-    "Train reinforcement learning on episodic rewards, through latent rewards that a language model wrote. "
+    "LaRe: a reward for every step, from one number per episode. "
     "lare-rl --version prints the version of the code; --debug, with any command, prints the traceback of an error."
 )
 COMMANDS = {

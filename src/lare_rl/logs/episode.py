@@ -80,8 +80,8 @@ def infer_layout(name: str, values: Mapping[str, Any], role: TaskSpec | None) ->
         is_discrete = array.dtype.kind in "iu" and (array.ndim == 1 or is_column)
         if is_discrete and kind not in sizes:
             raise LareError(
-                f"{name}: {kind}s are whole numbers, and the number of choices is unknown: write it into a task file ({kind}_size; "
-                "docs/reference/logs.md), and give it with --task FILE. If they are no choices, write them as floating-point numbers"
+                f"{name}: {kind}s are whole numbers, and the number of choices is unknown: write a task file by hand that has it "
+                f"({kind}_size; docs/reference/logs.md), for --task. If they are no choices, write them as floating-point numbers"
             )
         if is_discrete and sizes[kind] != 1:
             shape = (1,) if is_column else ()

@@ -32,6 +32,8 @@ class Log(ABC):
     layout: LogLayout
     n_episodes: int | None = None
     """The number of episodes; None if it is unknown."""
+    description: str = ""
+    """What its author says of it."""
 
     @abstractmethod
     def read(self) -> Iterator[tuple[str, Mapping[str, Any], Any]]:

@@ -41,6 +41,7 @@ class MinariLog(Log):
         self.dataset: MinariDataset = dataset
         self.name = str(dataset.spec.dataset_id)
         self.n_episodes = int(dataset.total_episodes)
+        self.description = str(dataset.storage.metadata.get("description") or "")
         if not self.n_episodes:
             raise LareError(f"{self.name} has no episode")
         self.group_key = None if role is None else role.group
@@ -103,7 +104,7 @@ class MinariLog(Log):
                     **{key: metadata[key] for key in COPIED_METADATA if metadata.get(key) is not None},
                     "dataset_id": dataset_id,
                     "minari_version": minari.__version__,
-                    "description": f"{metadata.get('description') or self.name}\n\n{comment}",
+                    "description": f"{self.description or self.name}\n\n{comment}",
                 }
             )
             storage.update_episodes(_episode_buffer(item, source.FORMAT) for item in episodes)

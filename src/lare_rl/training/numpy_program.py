@@ -1,7 +1,8 @@
 """A function of JAX as a program of NumPy calls.
 
 A policy on the host is called once for each step. For a small network, most of the time of a compiled call is spent in waking up XLA's
-threads. The same operations in NumPy take a fraction of the time. The results agree except for rounding.
+threads. The same operations in NumPy take a fraction of the time. The results agree except for rounding, and for conversions of numbers
+that an integer cannot hold.
 
 The arrays may be of another library, if it has functions with NumPy's names: `lare-rl export` builds the nodes of a graph like this.
 """
@@ -20,7 +21,8 @@ __all__ = ["UnsupportedOperationError", "to_numpy"]
 
 Operation = Callable[..., Any]
 ArrayFunctions = Callable[[str], Operation]
-"""From the name of a NumPy function to the function for these arrays. Raises `UnsupportedOperationError` if there is none."""
+"""From a name to a function for these arrays: NumPy's name, with NumPy's arguments, or `gather`, of the equation of JAX, an array and the
+positions. Raises `UnsupportedOperationError` if there is none."""
 
 
 class UnsupportedOperationError(Exception):
@@ -48,7 +50,8 @@ def to_numpy(
 
     Returns:
         A function from the first argument, as arrays of that library, to a function of the other arguments. What depends on the first
-        argument alone is computed once.
+        argument alone is computed once. Arguments have the shapes and types of `fixed` and `shapes`. Only their structure is
+        checked: another one is a `TypeError`.
 
     Raises:
         UnsupportedOperationError: the function has an operation that is not translated.
@@ -56,7 +59,7 @@ def to_numpy(
     arguments, registers, calls, results, structure = _trace(
         function, (fixed, *shapes), array_functions or _numpy_function
     )
-    n_fixed = len(jax.tree.leaves(fixed))
+    n_fixed, expected = len(jax.tree.leaves(fixed)), jax.tree.structure(shapes)
     once, each_time = _split_calls(calls, arguments[n_fixed:])
 
     def bind(fixed: Any) -> Callable[..., Any]:
@@ -65,8 +68,11 @@ def to_numpy(
         _run(once, bound)
 
         def run(*args: Any) -> Any:
+            leaves, actual = jax.tree.flatten(args)
+            if actual != expected:
+                raise TypeError(f"the arguments are {actual}, not {expected}")
             values = bound.copy()
-            values[n_fixed : len(arguments)] = jax.tree.leaves(args)
+            values[n_fixed : len(arguments)] = leaves
             _run(each_time, values)
             return jax.tree.unflatten(structure, [values[i] for i in results])
 
@@ -99,7 +105,7 @@ def _new_register(registers: list[Any], value: Any = None) -> int:
 
 
 class _Translator(NamedTuple):
-    """Appends the calls of a program, and of the programs that it calls."""
+    """Translates a program, and the programs inside it, into NumPy calls, which it appends to `calls`."""
 
     array_functions: ArrayFunctions
     registers: list[Any]
@@ -109,12 +115,12 @@ class _Translator(NamedTuple):
         """Append the calls of a program. Return the registers of its results."""
         jaxpr: Jaxpr = closed.jaxpr
         constants = [_new_register(self.registers, np.asarray(value)) for value in closed.consts]
-        register = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
+        register_of = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
 
         def find(atom: Any) -> int:
             if isinstance(atom, Literal):
                 return _new_register(self.registers, np.asarray(atom.val, _aval(atom).dtype))
-            return register[atom]
+            return register_of[atom]
 
         for equation in jaxpr.eqns:
             inputs = [find(atom) for atom in equation.invars]
@@ -133,7 +139,7 @@ class _Translator(NamedTuple):
                 outputs = [self._append(itemgetter(index), *inputs) for index in slices]
             else:
                 outputs = [self._append(_find_operation(equation, self.array_functions), *inputs)]
-            register.update(zip(equation.outvars, outputs, strict=True))
+            register_of.update(zip(equation.outvars, outputs, strict=True))
         return [find(atom) for atom in jaxpr.outvars]
 
     def _append(self, operation: Operation, *arguments: int) -> int:
@@ -144,6 +150,9 @@ class _Translator(NamedTuple):
     def _append_product(self, equation: JaxprEqn, inputs: Sequence[int]) -> int:
         """Append a product over the contracted axes, as a batch of matrix products. Return the register of its result."""
         sums, batches = equation.params["dimension_numbers"]
+        result = _aval(equation.outvars[0])
+        if any(_aval(atom).dtype != result.dtype for atom in equation.invars):
+            raise UnsupportedOperationError("dot_general of another type")
         transpose, reshape = self.array_functions("transpose"), self.array_functions("reshape")
         matrices = []
         for atom, register, contracted, batch, is_left in zip(
@@ -152,19 +161,19 @@ class _Translator(NamedTuple):
             shape = _aval(atom).shape
             free = [i for i in range(len(shape)) if i not in (*contracted, *batch)]
             axes = [*batch, *free, *contracted] if is_left else [*batch, *contracted, *free]
-            n_sum, lead = math.prod(shape[i] for i in contracted), [shape[i] for i in batch]
-            new_shape = [*lead, -1, n_sum] if is_left else [*lead, n_sum, -1]
+            n_free, n_sum = (math.prod(shape[i] for i in axes) for axes in (free, contracted))
+            lead = [shape[i] for i in batch]
+            new_shape = [*lead, n_free, n_sum] if is_left else [*lead, n_sum, n_free]
             if axes != sorted(axes) or len(free) != 1 or len(contracted) != 1:
                 register = self._append(
                     lambda x, axes=axes, shape=new_shape: reshape(transpose(x, axes), shape), register
                 )
             matrices.append(register)
-        shape = _aval(equation.outvars[0]).shape
-        return self._append(lambda x: reshape(x, shape), self._append(self.array_functions("matmul"), *matrices))
+        return self._append(lambda x: reshape(x, result.shape), self._append(self.array_functions("matmul"), *matrices))
 
 
 def _aval(atom: Any) -> Any:
-    """Return the shape and type of a value of a program."""
+    """Return the shape and type of a value of a program, which JAX's annotations do not declare."""
     return atom.aval
 
 
@@ -192,10 +201,12 @@ def _split_calls(calls: Sequence[_Call], arguments: Sequence[int]) -> tuple[list
 def _find_operation(equation: JaxprEqn, array_functions: ArrayFunctions) -> Operation:
     name, params = equation.primitive.name, equation.params
     inputs, result = [_aval(atom) for atom in equation.invars], _aval(equation.outvars[0])
-    if name in ELEMENTWISE and not (name == "div" and np.issubdtype(inputs[0].dtype, np.integer)):
+    if name == "div" and np.issubdtype(inputs[0].dtype, np.integer):  # JAX truncates the result
+        raise UnsupportedOperationError("div of integers")
+    if name in ELEMENTWISE:
         return array_functions(ELEMENTWISE[name])
     reshape, astype = array_functions("reshape"), array_functions("astype")
-    if name in REDUCTIONS:
+    if name in REDUCTIONS and (inputs[0].dtype == bool or name not in ("reduce_and", "reduce_or")):  # else bit by bit
         reduction = array_functions(REDUCTIONS[name])
         return lambda x: astype(reduction(x, axis=tuple(params["axes"])), result.dtype)
     match name:
@@ -262,7 +273,7 @@ METHODS: dict[str, Operation] = {
     "reshape": lambda x, shape: x.reshape(shape),
     "transpose": lambda x, axes: x.transpose(axes),
 }
-INLINED = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
+INLINED = ("jit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 """Operations that call another program."""
 ELEMENTWISE = {
     **{name: name for name in "abs cos exp expm1 log log1p sign sin sqrt square tanh".split()},
