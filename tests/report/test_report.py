@@ -85,6 +85,13 @@ def test_sections_of_report(runs, pages):
     assert "<title>step" in first_chart
 
 
+@pytest.mark.parametrize("method", ["bayes", pytest.param("dense", marks=pytest.mark.long)])
+def test_method_without_phi(method, small, tmp_path):
+    run = lare_rl.train(toy_spec(), small(method=method, capacity=240), out=tmp_path / "run", listeners=[])
+    page = page_of(run, tmp_path)
+    assert "The latent function" not in page
+
+
 def test_film(runs, tmp_path):
     """It is in the page if it is newer than the checkpoint, and small."""
     film, size = runs[0].directory / "film.webp", 10_000

@@ -44,7 +44,7 @@ class EpisodeCredit:
     """Whether the true rewards of single steps are known: they are not if all rewards of the newest steps are payments."""
     correlations: list[Float[np.ndarray, " _"]]
     """Pearson's correlation of each factor of each team with its true reward, over the newest steps of all seeds, about
-    `RECENT_STEPS` of each. NaN if one never varies, or step rewards are not known. Empty without phi."""
+    `RECENT_STEPS` of each. NaN if one never varies, or step rewards are not known. Without phi there are no factors."""
 
 
 class FactorLabel(NamedTuple):
@@ -130,14 +130,14 @@ def _factor_correlations(
     steps: StoredSteps, config: TrainConfig, is_known: bool
 ) -> list[Float[np.ndarray, " factors"]]:
     """Compute the correlations of each team's factors with its true reward."""
+    if not is_known or not config.n_factors:
+        return [np.full(n_factors, np.nan) for n_factors in config.n_factors or (0,) * len(config.env.teams)]
     correlations, alive = [], np.asarray(alive_agents(steps, config))
-    for i, (team, n_factors) in enumerate(zip(config.env.teams, config.n_factors, strict=False)):
+    for i, (team, n_factors) in enumerate(zip(config.env.teams, config.n_factors, strict=True)):
         factors = np.asarray(steps.columns["factors"])[..., config.team_slice(i), :n_factors]
         reward, mask = np.asarray(steps.columns["reward"])[..., team.agents], alive[..., team.agents]
         if config.team_level:
             reward = np.asarray(team_mean(steps.columns["reward"], alive, team))[..., None]
             mask = np.ones_like(reward, bool)
-        correlations.append(
-            column_correlations(factors[mask], reward[mask]) if is_known else np.full(n_factors, np.nan)
-        )
+        correlations.append(column_correlations(factors[mask], reward[mask]))
     return correlations
