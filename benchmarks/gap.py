@@ -125,7 +125,7 @@ def ten_seeds(study: str, task: str, raw: Sequence[str]) -> Comparison:
     )
 
 
-HALF_CHEETAH, WALKER, REACHER = "HalfCheetah-v4", "Walker2d-v4", "Reacher-v4"
+HALF_CHEETAH, WALKER, REACHER, TARGET = "HalfCheetah-v4", "Walker2d-v4", "Reacher-v4", "HalfCheetahTarget-v4"
 TEN_SEEDS = "scores/cheetah/HalfCheetah-v4,paidonce"
 THRESHOLD = "scores/threshold/HalfCheetahThreshold-v4"
 COMPARISONS = {
@@ -144,6 +144,7 @@ COMPARISONS = {
         [f"{TEN_SEEDS}/bayes"],
     ),
     f"{REACHER}, TD3": ten_seeds("headline", REACHER, ("rrdu",)),
+    f"{TARGET}, TD3": ten_seeds("headline", TARGET, ("rrdu",)),
     "HalfCheetahThreshold-v4, TD3": Comparison(
         60_000,
         [f"{THRESHOLD}/episodic"],
@@ -194,7 +195,6 @@ COMPARISONS = {
     ),
     "CN-6, IPPO": particles("CN-6"),
     "TriangleArea, IPPO": particles("TriangleArea"),
-    "HalfCheetahTarget-v4, TD3": hidden("HalfCheetahTarget-v4"),
     "HalfCheetahFoot-v4, TD3": hidden("HalfCheetahFoot-v4"),
     "HalfCheetahSaturating-v4, TD3": hidden("HalfCheetahSaturating-v4"),
 }
