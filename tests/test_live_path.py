@@ -119,7 +119,7 @@ def test_replies_are_saved(serve, design_live, tmp_path, text, options, status, 
     assert all(word in line for word in words)
     assert "\x1b" not in err
     name = "talk.json" if "--record" in options else "Reacher-v4.attempts-2.json"
-    assert ("every reply is kept in" in err) == ("--record" not in options)
+    assert f"every reply is kept in {name}\n" in err
     assert saved_stages(tmp_path / name) == ["candidate", *["correct"] * (n_replies - 1)]
 
 
@@ -148,6 +148,17 @@ def test_folder_that_cannot_be_written(serve, design_live, monkeypatch):
     status, out, err = design_live(server)
     assert (status, out, err.count("\n"), server.requests) == (2, "", 1, [])
     assert "Reacher-v4.attempts.json cannot be written" in err
+
+
+def test_replies_are_printed_if_they_cannot_be_saved(serve, design_live, tmp_path):
+    def answer(handler):
+        (tmp_path / "Reacher-v4.attempts.json").touch()  # another design was faster
+        return reply_with(to_reply(REACHER_PHI))(handler)
+
+    status, out, err = design_live(serve(answer), "--candidates", 1)
+    assert (status, "kept" in err) == (2, False)
+    assert [exchange.replies for exchange in read_recording(out, "output").exchanges] == [[to_reply(REACHER_PHI)]]
+    assert (tmp_path / "Reacher-v4.attempts.json").read_text() == ""
 
 
 @pytest.mark.parametrize(("is_full", "n_files"), [(True, 1), (False, 0)])

@@ -94,7 +94,9 @@ def record_replies(name: str, model: "Model", live: LiveOptions, record: Path | 
     """Yield the file in which replies are recorded. Print what a live model has cost.
 
     Without `record`, it is NAME.attempts.json for a live model, whose replies are paid for. This file stays only after an error.
+    If the last reply could not be saved, all are printed.
     """
+    from lare_rl.latent.design import DesignError
     from lare_rl.llm.live import LiveModel
 
     if not isinstance(model, LiveModel):
@@ -105,11 +107,19 @@ def record_replies(name: str, model: "Model", live: LiveOptions, record: Path | 
         yield path
         if record is None:
             path.unlink(missing_ok=True)
+    except DesignError as error:
+        if error.recorder.is_saved:
+            print_progress(f"every reply is kept in {path}")
+        else:  # the disk may be full, or another design may have taken the name
+            print_line(error.recorder.to_json())
+        raise
+    except BaseException:
+        if path.exists():
+            print_progress(f"every reply is kept in {path}")
+        raise
     finally:
         if model.budget.requests_used:
             print_progress(f"{model.name}: {model.budget.summary(live.price)}")
-        if record is None and path.exists():
-            print_progress(f"every reply is kept in {path}")
 
 
 def _next_command(task: str, spec: "TaskSpec", out: Path, kind: FunctionKind, data: str | None) -> str:

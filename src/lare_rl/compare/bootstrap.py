@@ -34,6 +34,8 @@ REPETITIONS = 2000
 """Number of bootstrap samples."""
 CHUNK = 100
 """The number of samples that are in memory at a time."""
+MAX_EXACT = 100
+"""The largest number of values of a task for which `mann_whitney` is exact."""
 PERCENTILES = 2.5, 97.5
 """The ends of an interval."""
 
@@ -141,14 +143,31 @@ def mann_whitney(tasks: Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray
         U = sum over tasks and over all pairs of [a > b] + [a = b] / 2
 
     `tasks` has the values a and b of each task. If they had the same distribution, all ways to split them into two groups would
-    be equally likely. It takes time ~ n^4: 3 s for 100 values against 100.
+    be equally likely. The probabilities are exact for up to `MAX_EXACT` values of a task, because they take time ~ n^4.
     """
+    if max(len(a) + len(b) for a, b in tasks) > MAX_EXACT:
+        return _normal_approximation(tasks)
     double_u, probabilities = 0, np.ones(1)
     for a, b in tasks:
         double_u += round(2 * mann_whitney_u(a, b))
         probabilities = np.convolve(probabilities, _distribution(np.concatenate([a, b]), len(a)))
     at_least, at_most = probabilities[double_u:].sum(), probabilities[: double_u + 1].sum()
     return min(1.0, float(at_least)), min(1.0, float(at_most))
+
+
+def _normal_approximation(
+    tasks: Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]],
+) -> tuple[float, float]:
+    """Return the probabilities of `mann_whitney` by a normal distribution, with corrections for continuity and for ties."""
+    excess = variance = 0.0
+    for a, b in tasks:
+        n, n_equal = len(a) + len(b), np.unique(np.concatenate([a, b]), return_counts=True)[1].astype(float)
+        excess += mann_whitney_u(a, b) - len(a) * len(b) / 2
+        variance += len(a) * len(b) / 12 * (n + 1 - np.sum(n_equal**3 - n_equal) / (n * (n - 1)))
+    if not variance:
+        return 1.0, 1.0
+    at_least, at_most = (math.erfc((sign * excess - 0.5) / math.sqrt(2 * variance)) / 2 for sign in (1, -1))
+    return at_least, at_most
 
 
 def two_sided_p(tasks: Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]) -> float:

@@ -39,7 +39,7 @@ MESSAGES = {
     "or 1. Neither is computed for a single seed. If the score is an error or a loss, a low probability is good. p: "
     "exact two-sided Mann-Whitney test. If a method has several draws of the language model, the mean over the draws of a seed counts "
     "as one run.",
-    "intervals": "Intervals: stratified bootstrap over the seeds, {repetitions} repetitions; in the column with draws, over the draws "
+    "intervals": "Intervals: bootstrap over the seeds, {repetitions} repetitions; in the column with draws, over the draws "
     "of the language model.",
     "curves": "Lines: IQM over the seeds. Bands: its 95% intervals.",
     "over_tasks": "All tasks: each run is compared with the runs on the same task.",

@@ -31,6 +31,8 @@ class Recorder:
     exchanges: list[Exchange] = field(default_factory=list)
     owns_file: bool = field(init=False, default=False)
     """Whether the file at `path` is this recorder's, so that it may be replaced."""
+    is_saved: bool = field(init=False, default=False)
+    """Whether the file has the last reply."""
 
     def __post_init__(self) -> None:
         if self.path is not None:
@@ -59,9 +61,10 @@ class Recorder:
         earlier = same[-1].replies if is_last else []
         exchange = Exchange(stage=stage, messages=list(messages), replies=[*earlier, reply])  # it may be refused
         self.exchanges[len(self.exchanges) - is_last :] = [exchange]
+        self.is_saved = False
         if self.path is not None:
             self.save(self.path, new=not self.owns_file)
-            self.owns_file = True
+            self.owns_file = self.is_saved = True
         return reply
 
     def save(self, path: Path, new: bool = True) -> None:

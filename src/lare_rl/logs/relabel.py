@@ -6,8 +6,8 @@ and writes them.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -72,11 +72,11 @@ class Relabelled:
     steps: int
     cut: int
     """Episodes that were cut before their end. They get rewards, but nothing is learned from them."""
-    returns: Sequence[float]
+    returns: Sequence[float] = field(repr=False)
     """The returns of the complete episodes that were held out of the fit."""
-    predictions: Sequence[float]
+    predictions: Sequence[float] = field(repr=False)
     """The predictions of these returns."""
-    groups: Sequence[Any]
+    groups: Sequence[Any] = field(repr=False)
     """The groups of these episodes; empty without groups."""
     explanation: tuple[str, ...]
     """What the returns say about the factors: `CreditAssigner.explanation`."""
@@ -96,14 +96,14 @@ class Relabelled:
         """The standard error of `return_r2` over these episodes."""
         return self._r2_and_error()[1]
 
-    @property
+    @cached_property
     def group_r2(self) -> float:
         """R^2 of the differences of these returns from the means of their groups. NaN without groups and, as for
         `return_r2`, for too few or equal returns, or if r_hat is not in the unit of returns.
         """
         return _r2_within_groups(self.returns, self.predictions, self.groups) if self.calibrated else math.nan
 
-    @property
+    @cached_property
     def return_correlation(self) -> float:
         """Pearson's correlation of these returns with their predictions.
 
