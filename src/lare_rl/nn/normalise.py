@@ -55,12 +55,13 @@ def update_mean_std(
 def merge_means(n: Any, mean: Any, n_new: Any, new_mean: Any, square: Any = lambda d: d**2) -> tuple[Any, Any, Any]:
     """Merge the mean of `n` old rows and that of `n_new` new rows.
 
-    Return the number of all rows, their mean, and `between` = d^2 n n_new / (n + n_new), where d is the difference of the two means:
+    Return the number of all rows, their mean, and `between` = d^2 n n_new / (n + n_new), where d is the difference of the two means. With S
+    the sum of squared deviations of some rows from their own mean:
 
-        sum of squares of all rows = that of the old rows + that of the new rows + between
+        S of all rows = S of the old rows + S of the new rows + between
 
-    Means have the shape (features,), and so has `between`; with `square=jnp.outer` it is (features, features), for sums of products of
-    deviations. The parallel update of Chan, Golub and LeVeque (1983), which avoids catastrophic cancellation.
+    Means have the shape (features,), and so has `between`. With `square=lambda d: jnp.outer(d, d)` it is (features, features), for sums of
+    products of deviations. The parallel update of Chan, Golub and LeVeque (1983), which avoids catastrophic cancellation.
     """
     n_all, difference = n + n_new, new_mean - mean
     fraction = n_new / jnp.maximum(n_all, 1)
@@ -68,9 +69,9 @@ def merge_means(n: Any, mean: Any, n_new: Any, new_mean: Any, square: Any = lamb
 
 
 def running_std(statistics: RunningMeanStd) -> Float[Array, "*features"]:
-    """Return the standard deviation of each feature (divided by n).
+    """Return the standard deviation of each feature. The variance is divided by n, not by n - 1.
 
-    It is 0 if it is at most `FLOAT32_NOISE` of the mean, which float32 cannot tell from no variation.
+    A deviation of at most `FLOAT32_NOISE` of the mean may be rounding in float32, and counts as 0.
     """
     std = jnp.sqrt(statistics.sum_squares / jnp.maximum(statistics.n_rows, 1))
     return jnp.where(std > FLOAT32_NOISE * jnp.abs(statistics.mean), std, 0)
@@ -100,7 +101,7 @@ class Scale(NamedTuple):
 
 
 def empty_scale() -> Scale:
-    """Return the scale of no episodes."""
+    """Return the scale before the first episode."""
     return Scale(*(jnp.zeros(()) for _ in Scale._fields))
 
 
@@ -120,7 +121,7 @@ def update_scale(scale: Scale, values: Float[Array, " batch"], mask: Bool[Array,
 
 
 def min_max_scale(scale: Scale, values: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return (x - lowest) / (highest - lowest), or 0.5 while lowest and highest are the same. Values outside are not clipped."""
+    """Return (x - lowest) / (highest - lowest), or 0.5 while lowest and highest are the same. Values outside this range are not clipped."""
     width = scale.highest - scale.lowest
     return jnp.where(width > 0, (values - scale.lowest) / jnp.where(width > 0, width, 1), 0.5)
 

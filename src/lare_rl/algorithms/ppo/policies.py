@@ -14,7 +14,7 @@ UNAVAILABLE_LOGIT = -1e9
 
 
 class StochasticPolicy(eqx.Module):
-    """A Gaussian whose standard deviation does not depend on the state or, if `log_std` is None, a categorical distribution.
+    """A categorical distribution if `log_std` is None; else a Gaussian, whose standard deviation is the same in all states.
 
     The caller normalises the observations.
     """
@@ -31,8 +31,8 @@ class StochasticPolicy(eqx.Module):
         """Return log pi(a | s)."""
         if self.log_std is None:
             return jnp.sum(action * jax.nn.log_softmax(self.logits(observation, available)), axis=-1)
-        z = (action - self.network(observation)) * jnp.exp(-self.log_std)
-        return jnp.sum(-0.5 * z**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
+        deviation = (action - self.network(observation)) * jnp.exp(-self.log_std)
+        return jnp.sum(-0.5 * deviation**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
 
     def entropy(self, observation: Observation, available: Available = None) -> PerStep:
         """Return the entropy, -E log pi(a | s)."""
@@ -43,7 +43,11 @@ class StochasticPolicy(eqx.Module):
         return jnp.broadcast_to(jnp.sum(entropy, axis=-1), observation.shape[:-1])
 
     def sample(self, observation: Observation, noise: Action, available: Available = None) -> Action:
-        """Return the action for this noise: standard normal or, for choices, Gumbel."""
+        """Return the action for this noise: standard normal or, for choices, Gumbel.
+
+        The choice with the largest logit + Gumbel noise is a sample from the softmax of the logits. Other actions are not clipped here, but
+        when the environment gets them.
+        """
         if self.log_std is None:
             return _choose(self.logits(observation, available) + noise)
         return self.network(observation) + jnp.exp(self.log_std) * noise
