@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 def _read_public_names() -> dict[str, tuple[str, str]]:
-    """Return the public names, which are those that the block above imports. Only type checkers execute it."""
+    """Return the public names: the names that the block above imports. Only type checkers execute that block."""
     tree = ast.parse(Path(__file__).read_text(encoding="utf-8"))
     block = next(node for node in tree.body if isinstance(node, ast.If))
     imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]

@@ -101,7 +101,7 @@ def test_evaluate_command(runs, command, tmp_path):
 
 def test_report(runs):
     run = runs[0]
-    details = "\n".join(render_details(run))
+    details = "\n".join(render_details(run, ()))
     check_markup(details.replace('href="#', 'href="'))
     assert "nan" not in details
     for role in run.config.task.roles:

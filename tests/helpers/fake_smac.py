@@ -6,7 +6,7 @@ import numpy as np
 
 
 class FakeSmac:
-    """Two units, of which the second dies in the first step. `results` is an iterator over those of the steps, also of later games."""
+    """Two units. The second unit dies in the first step. `results` is an iterator over the results of the steps, also of later games."""
 
     launched: tuple[int, ...] = ()
 

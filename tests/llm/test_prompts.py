@@ -13,7 +13,7 @@ DIALOGUE = [{"role": "system", "content": "You write code."}, {"role": "user", "
 
 
 def test_recorded_requests():
-    """Of the recordings that are shipped, and of those of the real simulators."""
+    """The shipped recordings, and the recordings of the real simulators."""
     shipped = [entry for kind in ("factors", "reward") for entry in (SHIPPED_RECORDINGS / kind).iterdir()]
     real = list((REAL / "recordings").iterdir())
     assert (len(shipped) > 50, len(real)) == (True, 10)

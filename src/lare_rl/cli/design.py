@@ -107,14 +107,13 @@ def record_replies(name: str, model: "Model", live: LiveOptions, record: Path | 
         yield path
         if record is None:
             path.unlink(missing_ok=True)
-    except DesignError as error:
-        if error.recorder.is_saved:
-            print_progress(f"every reply is kept in {path}")
-        else:  # the disk may be full, or another design may have taken the name
+    except BaseException as error:
+        has_replies = isinstance(error, DesignError)
+        if (
+            has_replies and not error.recorder.is_saved
+        ):  # the disk may be full, or another design may have taken the name
             print_line(error.recorder.to_json())
-        raise
-    except BaseException:
-        if path.exists():
+        elif has_replies or (model.budget.requests_used and path.exists()):  # a file that existed before is not ours
             print_progress(f"every reply is kept in {path}")
         raise
     finally:

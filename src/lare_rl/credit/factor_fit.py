@@ -128,9 +128,9 @@ def predict_returns(
         has_groups=level is not None,
     )
     state = decoder_state.init(jax.random.key(0), spec)
-    closed = closed_form.init(spec.basis, spec.score_types)
+    assert state.closed_form is not None
     state = state._replace(
-        closed_form=closed_form.reset_statistics(closed, _statistics(factors, alive)),
+        closed_form=closed_form.reset_statistics(state.closed_form, _statistics(factors, alive)),
         predictions=empty_predictions(1, count),
         score_type_predictions=empty_predictions(2, count) if len(spec.score_types) > 1 else None,
     )

@@ -71,7 +71,7 @@ def record_frames(
 
     Args:
         max_fps: the largest number of frames per second, for a simulation on the host. A film of an environment in JAX has 25 frames
-            per second, and a film of many agents has 8.
+            per second. A film of many agents has 8 frames per second.
         max_frames: the largest number of frames. A longer film ends early; that of a single agent in JAX leaves steps out, and so
             shows the episode faster.
 

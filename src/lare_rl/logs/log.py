@@ -104,7 +104,7 @@ def check_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> No
 
 
 def list_files(directory: Path, suffix: str) -> list[Path]:
-    """Return the files of a log by their names. Hidden ones, such as those that archives of macOS have, are no part of it."""
+    """Return the files of a log in the order of their names, without hidden files, such as those in archives of macOS."""
     return sorted(path for path in directory.glob(f"*{suffix}") if not path.name.startswith("."))
 
 

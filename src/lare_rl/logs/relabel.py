@@ -89,12 +89,12 @@ class Relabelled:
     @property
     def return_r2(self) -> float:
         """R^2 of their returns. NaN for fewer than `MIN_R2_EPISODES`, for equal returns, or if r_hat is not in the unit of returns."""
-        return self._r2_and_error()[0]
+        return self._r2_and_error[0]
 
     @property
     def return_r2_error(self) -> float:
         """The standard error of `return_r2` over these episodes."""
-        return self._r2_and_error()[1]
+        return self._r2_and_error[1]
 
     @cached_property
     def group_r2(self) -> float:
@@ -127,6 +127,7 @@ class Relabelled:
         """The result and the explanation as sentences."""
         return [*(render(finding, MESSAGES) for finding in self.findings), *self.explanation]
 
+    @cached_property
     def _r2_and_error(self) -> tuple[float, float]:
         if not self.calibrated or self.held_out < MIN_R2_EPISODES:
             return math.nan, math.nan

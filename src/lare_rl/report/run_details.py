@@ -45,7 +45,7 @@ _BAR_STYLES = {"plus": "the reward of a step rises with the factor", "minus": "i
 """The meanings of the colours of bars."""
 
 
-def render_details(run: Run, trust: Sequence[str] = ()) -> Iterable[str]:
+def render_details(run: Run, trust: Sequence[str]) -> Iterable[str]:
     """Yield what a run's checkpoint and files show.
 
     Args:

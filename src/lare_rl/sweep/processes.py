@@ -80,7 +80,7 @@ def _close_input(process: subprocess.Popen) -> None:
 def train_in_process(job: Job, slot: Slot, running: list[subprocess.Popen], stopped: threading.Event) -> str | None:
     """Train a job in a new process, which writes its output to RUN.log. Return the error, or None.
 
-    The process is added to those that are `running`. After `stopped` is set, none is started.
+    It adds the process to the list `running`. After `stopped` is set, it starts no process.
     """
     if stopped.is_set():
         return "it was not started, because the sweep was stopped"

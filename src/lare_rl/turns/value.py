@@ -77,7 +77,7 @@ def posterior_stds(
 
 
 def _rows(table: TurnTable, x: Float[np.ndarray, "turns features"], fit: PrefixFit) -> Float[np.ndarray, "turns n"]:
-    """Return the derivative of the prediction with respect to (v, m), of which b is a function."""
+    """Return the derivative of the prediction with respect to (v, m). b is a function of (v, m)."""
     return np.column_stack([x - fit.x_mean, np.ones(len(x))]) - fit.group_row[table.group][table.rollout_index]
 
 
