@@ -85,7 +85,6 @@ def measure(row: Row, directory: Path, phases: bool, trace: str) -> dict[str, An
         "evaluation s": round(time.perf_counter() - start, 3),
         "first evaluation s": round(first_s, 2),
         "s before": round(before_s, 1),
-        "batched": session.config.batched,
     }
     if phases and session.loop is None:
         result["ms per iteration by phase"] = _time_phases(session, 30)

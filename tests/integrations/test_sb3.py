@@ -240,6 +240,8 @@ def test_second_learn_drops_running_episodes():
     credit = make_assigner()
     model = on_policy(make_envs(1, ConstantChase)[0])
     assert learn_again(model, credit, 32, [True, True], callback=CreditCallback(credit, 5)) == [0, 1]
+    model.set_env(model.get_env())  # the next `learn` resets the environments
+    assert learn_again(model, credit, 32, [False], callback=CreditCallback(credit, 5)) == [2]
     assert "compute_returns_and_advantage" not in vars(model.rollout_buffer)
     model.learn(32)  # without the callback, by the environment's rewards
     assert np.abs(model.rollout_buffer.rewards).max() > 0

@@ -117,7 +117,7 @@ def test_attempts_end(chase):
     bad = [failing_reply(f"attempt_{number}") for number in range(1, ATTEMPTS + 1)]
     assert len(design(chase, model=scripted(*bad[1:], GOOD), candidates=1).exchanges) == ATTEMPTS
     model, messages = scripted(*bad, GOOD), []
-    with pytest.raises(DesignError, match=r"'Chase'.*attempt_5 is not defined") as error:
+    with pytest.raises(DesignError, match=r"Chase: .*attempt_5 is not defined") as error:
         design(chase, model=model, candidates=1, on_message=messages.append)
     assert messages == [f"attempt {number}: {error_text(f'attempt_{number}')}" for number in range(1, 6)]
     assert model.replies == [GOOD]

@@ -31,7 +31,7 @@ def run(tmp_path):
 def test_open_run_equals_created_and_replaced_function(run, monkeypatch):
     opened = open_run(run.directory)
     assert opened.config == run.config
-    assert opened.function.digest == run.function.digest
+    assert opened.functions[0].digest == run.functions[0].digest
     assert as_run(run) is run
     assert {"jax", "python"} < set(run.config.versions)
     monkeypatch.setattr(config_file, "VERSIONED_PACKAGES", ("jax", "no-such-extra"))
@@ -39,11 +39,11 @@ def test_open_run_equals_created_and_replaced_function(run, monkeypatch):
     # Format 4 had runs that replaced phi. The checkpoint has the hash of the one in use.
     new = verify_function(PHI.replace("near", "close"), toy_spec())
     new.save(run.directory / "latent_function-600.py")
-    assert open_run(run.directory).function.digest == run.function.digest
+    assert open_run(run.directory).functions[0].digest == run.functions[0].digest
     (run.directory / "checkpoint").mkdir()
     host = {"step": 900, "functions_since": 600, "function_sha256": [new.digest]}
     np.savez(run.checkpoint / "state.npz", host=np.array(json.dumps(host)))
-    assert open_run(run.directory).function.digest == new.digest
+    assert open_run(run.directory).functions[0].digest == new.digest
 
 
 def test_metrics_are_parsed_once_per_file_state(run, monkeypatch):

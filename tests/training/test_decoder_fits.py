@@ -59,7 +59,7 @@ def test_update_in_chunks_is_that_of_the_batch(monkeypatch):
 def test_seeds_are_fitted_at_once_or_one_after_the_other():
     config, keys = small_config("rd", fit_updates=2), jax.random.split(jax.random.key(0))
     seeds = stack_seeds(*(learner_with_episodes(config, seed) for seed in (0, 1)))
-    fits = (jax.jit(partial(fit_seeds, config=replace(config, batched=batched))) for batched in (False, True))
+    fits = (jax.jit(partial(fit_seeds, config=replace(config, vectorized=vectorized))) for vectorized in (False, True))
     assert_close(*(fit(seeds, keys) for fit in fits), 1e-3, 1e-6)
 
 

@@ -33,7 +33,7 @@ from lare_rl.util.provenance import code_version
 
 def test_config_names_everything_a_run_depends_on(factor_run, phi, tmp_path):
     run = copy_run(factor_run, tmp_path / "run")
-    assert run.function.source == phi.source
+    assert run.functions[0].source == phi.source
     config = json.loads((run.directory / "config.json").read_text())
     assert config["function_sha256"] == [phi.digest]
     assert config["task_sha256"] == toy_spec().digest

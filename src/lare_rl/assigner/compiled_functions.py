@@ -1,4 +1,4 @@
-"""The compiled functions of a `CreditAssigner`: functions of `lare_rl.credit`, on batches of steps and episodes."""
+"""The compiled functions of a `CreditAssigner`, from `lare_rl.credit` and `lare_rl.data`; and where, and on how many steps, they run."""
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
@@ -18,7 +18,8 @@ from lare_rl.data import layouts
 from lare_rl.errors import LareError
 
 MAX_CALL_STEPS = 8192
-"""The most steps of one call; in a batch of episodes, of all agents together. An episode that is longer is one call."""
+"""The most steps of one call, except in gradient updates. A batch of whole episodes counts the steps of all agents, and is then padded
+(`padded_size`). An episode that is longer is one call."""
 
 init_decoder = jax.jit(decoder_state.init, static_argnames="spec")
 observe_steps = jax.jit(decoder_state.observe_steps)
@@ -40,10 +41,12 @@ sample_steps = jax.jit(layouts.sample_steps, static_argnames="steps")
 def fit_by_gradient(
     state: DecoderState, batches: CreditBatch, keys: Key[Array, " updates"], spec: CreditSpec
 ) -> tuple[DecoderState, Float[Array, ""]]:
-    """Update the decoder once for each batch. Also return the mean of the losses."""
+    """Update the decoder once for each batch, along the leading axis of `batches`. Also return the mean of the losses."""
 
-    def body(state: DecoderState, inputs: tuple[CreditBatch, Key[Array, ""]]) -> tuple[DecoderState, Float[Array, ""]]:
-        state, metrics = descent.update(state, *inputs, spec)
+    def body(
+        state: DecoderState, batch_and_key: tuple[CreditBatch, Key[Array, ""]]
+    ) -> tuple[DecoderState, Float[Array, ""]]:
+        state, metrics = descent.update(state, *batch_and_key, spec)
         return state, metrics["credit/loss"]
 
     state, losses = jax.lax.scan(body, state, (batches, keys))
@@ -58,8 +61,8 @@ def training_rewards(
     return rewards.training_rewards(jax.tree.unflatten(structure, leaves), steps, spec)
 
 
-def call_chunks(n_steps: int) -> Iterator[slice]:
-    """Yield the steps of each call, at most `MAX_CALL_STEPS`."""
+def chunk_slices(n_steps: int) -> Iterator[slice]:
+    """Yield slices of at most `MAX_CALL_STEPS` steps, which cover all `n_steps`."""
     return (slice(start, start + MAX_CALL_STEPS) for start in range(0, n_steps, MAX_CALL_STEPS))
 
 

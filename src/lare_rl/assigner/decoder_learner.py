@@ -20,7 +20,7 @@ from jaxtyping import Int
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.batches import sample_batch, whole_episodes
-from lare_rl.assigner.compiled_functions import MAX_CALL_STEPS, call_chunks, on_cpu
+from lare_rl.assigner.compiled_functions import MAX_CALL_STEPS, chunk_slices, on_cpu
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit import closed_form, learning, prequential
 from lare_rl.credit.decoder_state import DecoderState
@@ -121,7 +121,7 @@ class DecoderLearner:
         self.n_pending_steps = 0
         try:
             chunks = [
-                self.config.compute_inputs(*(rows[chunk] for rows in steps)) for chunk in call_chunks(len(step_ids))
+                self.config.compute_inputs(*(rows[chunk] for rows in steps)) for chunk in chunk_slices(len(step_ids))
             ]
         except LareError:
             self._forget_since(int(step_ids[0]))
@@ -161,7 +161,7 @@ class DecoderLearner:
             return
         inputs, alive = (np.concatenate(arrays) for arrays in zip(*self._pending_inputs, strict=True))
         self._pending_inputs.clear()
-        for chunk in call_chunks(len(inputs)):
+        for chunk in chunk_slices(len(inputs)):
             size = padded_size(len(inputs[chunk]))
             rows, mask = pad_rows(inputs[chunk], size), pad_rows(alive[chunk], size)
             with on_cpu():

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.batches import whole_episodes
-from lare_rl.assigner.compiled_functions import call_chunks, on_cpu
+from lare_rl.assigner.compiled_functions import chunk_slices, on_cpu
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.credit import decoder_state, logistic
 from lare_rl.credit.decoder_state import DecoderState
@@ -75,7 +75,7 @@ class StepRewards:
             arrays["alive"] = np.ones(agent_shape, bool)
         steps = StepBatch(**arrays)
         # Chunks have few sizes, so that few programs are compiled.
-        for chunk in call_chunks(len(reward)):
+        for chunk in chunk_slices(len(reward)):
             selected = jax.tree.map(itemgetter(chunk), steps)
             count = len(selected.length)
             padded = jax.tree.map(partial(pad_rows, size=padded_size(count)), selected)

@@ -64,6 +64,8 @@ def new_task(
             Parquet file, or the id of a local Minari data set.
         out: the file to write, which must not exist; the default is the task's name with .toml.
     """
+    from lare_rl.new_task.draft import LIMIT_LINE
+
     draft = _draft(environment)
     path = out or Path(f"{draft.name}.toml")
     paths = [path, *(path.parent / name for name in draft.teams)]
@@ -75,6 +77,8 @@ def new_task(
         write_bytes(new, text.encode())
     print_line(f"wrote {', '.join(map(str, paths))}")
     print_line("  its first lines say what was left out, if anything")
+    if LIMIT_LINE in draft.toml:
+        print_line("  max_episode_steps is a guess: write the length of the longest episode, or more")
     where = f" of {', '.join(map(str, paths))}" if draft.teams else ""
     for key in draft.missing_keys:
         print_line(

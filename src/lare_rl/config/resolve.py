@@ -4,7 +4,7 @@ from typing import Any
 
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm, Consumes, SequenceSettings
 from lare_rl.config.effective import reads_old_steps, unused_names
-from lare_rl.config.settings import ResolvedSettings, Settings, round_up
+from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.config.train_config import make_train_config
 from lare_rl.config.validity import check_training
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
@@ -15,6 +15,7 @@ from lare_rl.envs.interface import EnvSpec
 from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.util.rounding import round_up
 
 __all__ = ["choose_algorithm", "fill_in", "resolve"]
 
@@ -159,7 +160,7 @@ def _check_size(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Non
         batch_size, rows = resolved.hyperparameters.batch_size, env.max_steps + 1
         n_held = resolved.capacity // resolved.environments // rows * resolved.environments
         if n_held < batch_size:
-            enough = -(-batch_size // resolved.environments) * rows * resolved.environments
+            enough = round_up(batch_size, resolved.environments) * rows
             raise LareError(
                 f"capacity = {resolved.capacity} holds {n_held} of the longest episodes of {task.name}, and an update reads {batch_size}: "
                 f"use a capacity of {enough} or more, or a smaller {resolved.algorithm}.batch_size"

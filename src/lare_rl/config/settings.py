@@ -1,6 +1,5 @@
 """The settings of a run: `Settings`, as a user gives them, and `ResolvedSettings`, in which every value is decided."""
 
-import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, Never, TypeVar
 
@@ -12,19 +11,20 @@ from lare_rl.credit.methods import METHODS
 from lare_rl.errors import CheckedModel, Count
 from lare_rl.llm.prompts import N_CANDIDATES
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
+from lare_rl.util.rounding import round_up
 
-__all__ = ["ResolvedSettings", "Settings", "round_up"]
+__all__ = ["ResolvedSettings", "Settings"]
 
 MAX_STEPS = 2**30
 """Steps and rows of the replay are counted in int32, and an episode of one step takes two rows."""
-MAX_SEED = 2**31 - 1
-MAX_SEEDS = 1000
+LARGEST_SEED = 2**31 - 1
+MAX_N_SEEDS = 1000
 """In one process."""
 
 Undecided = TypeVar("Undecided")
 """The type of a value that is not decided yet: None in `Settings`, and Never in `ResolvedSettings`."""
 UNDECIDED: Any = None
-"""The default of these settings."""
+"""The default of a setting that may be undecided. `Any`, because `ResolvedSettings` does not accept it."""
 
 
 class _RunSettings(CheckedModel, Generic[Undecided]):
@@ -32,23 +32,23 @@ class _RunSettings(CheckedModel, Generic[Undecided]):
     """How credit is assigned (`lare-rl methods`). By default lare-bayes; with qmix and vdn lare-rd."""
     algorithm: str | Undecided = UNDECIDED
     """What trains the policy (`lare-rl algorithms`). By default, for one agent, ppo with discrete actions, else td3; for many,
-    qmix with a global state and action masks, else ippo."""
+    qmix for one team with a global state and action masks, else ippo."""
     steps: Annotated[int, Field(ge=1, le=MAX_STEPS)] | Undecided = UNDECIDED
-    """Environment steps of each seed; all agents act in one step. By default 1,000,000 for one agent, about 2,000,000 for
-    many."""
+    """Environment steps of each seed; all agents act in one step. By default about 1,000,000 for one agent, and about
+    2,000,000 for many."""
     seeds: Count = 1
     """Number of seeds, trained in lockstep."""
-    seed: Annotated[int, Field(ge=0, le=MAX_SEED)] = 0
+    seed: Annotated[int, Field(ge=0)] = 0
     """The first seed; the others follow it."""
     scored_observation: ScoredObservation | None = None
-    """Overrides the task's key: which observations factors and raw features are computed from."""
+    """Replaces the task's key of this name: the observations that factors and raw features are computed from."""
     draw: Annotated[int, Field(ge=0)] = 0
-    """The recorded reply that phi comes from (0 to 4); independent of the seed."""
+    """The number of the recorded design that phi comes from: 0, or up to 4 for tasks that have five; independent of the seed."""
     candidates: Count = N_CANDIDATES
-    """Candidates that phi is combined from; with 1, no self-prompting. The shipped recordings have 1 and 5."""
+    """Candidates that are combined into phi; with 1, nothing is combined. There are recorded replies for 1 and for 5."""
     environments: Count | Undecided = UNDECIDED
-    """Copies of the environment for each seed; several on the host run in worker processes. By default 1 on the host; in JAX 82
-    for ippo and 8 for qmix."""
+    """Copies of the environment for each seed; several on the host run in worker processes. By default 1; in JAX 82 for
+    ippo, and 8 for qmix and vdn."""
     rollout_steps: Count | Undecided = UNDECIDED
     """Steps of each copy in an iteration (collect, store, fit, update). By default 50. For ppo, all copies together have 2000,
     rounded to episodes of the maximum length. For ippo, a copy has one episode if all episodes are equally long; else all copies
@@ -64,38 +64,41 @@ class _RunSettings(CheckedModel, Generic[Undecided]):
     (published)."""
     evaluate_every: Count | Undecided = UNDECIDED
     """Environment steps between two evaluations; one also follows the last step. By default 5000 for td3, ddpg and sac, about
-    10,000 for qmix, about 20,000 for ippo, and 5 iterations for ppo. A short run of ippo or ppo is evaluated more often, so that
-    it has 5 evaluations."""
+    10,000 for qmix and vdn, about 20,000 for ippo, and 5 iterations for ppo. A short run of ippo or ppo is evaluated more often,
+    so that it has 5 evaluations."""
     evaluation_episodes: Count | Undecided = UNDECIDED
-    """Episodes in one evaluation. By default 10; in JAX 50 for ippo and 32 for qmix."""
-    capacity: Annotated[int, Field(ge=4)] | Undecided = UNDECIDED
+    """Episodes in one evaluation. By default 10; in JAX 50 for ippo, and 32 for qmix and vdn."""
+    capacity: Count | Undecided = UNDECIDED
     """Rows in a seed's replay; an episode of T steps takes T + 1. By default 1,000,000; 15,000 of the longest episodes for
-    ippo, and 5000 for qmix."""
+    ippo, and 5000 for qmix and vdn."""
     scale_rewards: bool = False
     """Divide rewards by the running root mean square of R/T. No effect with ppo and ippo."""
     overlap_collection: bool = False
-    """Collect the next steps while the device updates: faster on an accelerator, with a policy one update older. For algorithms that
-    consume transitions, in an environment on the host."""
+    """Collect the next steps while the device updates: faster on an accelerator, with a policy one iteration older. For algorithms
+    that consume transitions, in an environment on the host."""
     credit: CreditSettings | Undecided = UNDECIDED
     """How the decoder is fitted. The algorithm decides each of these settings that is not given."""
 
     @field_validator("method", "algorithm")
     @classmethod
-    def _find_name(cls, name: Any, info: Any) -> Any:
+    def _check_name(cls, name: Any, info: Any) -> Any:
         if name is not None:
             {"method": METHODS, "algorithm": ALGORITHMS}[info.field_name].find(name)
         return name
 
     @model_validator(mode="after")
     def _check_seeds(self) -> "_RunSettings":
-        if self.seeds > MAX_SEEDS:
-            raise ValueError(f"seeds = {self.seeds}: at most {MAX_SEEDS} train in one process")
-        if self.seed + self.seeds - 1 > MAX_SEED:
-            raise ValueError(f"seed = {self.seed} with seeds = {self.seeds}: the largest seed is {MAX_SEED}")
+        if self.seeds > MAX_N_SEEDS:
+            raise ValueError(f"seeds = {self.seeds}: at most {MAX_N_SEEDS} train in one process")
+        if self.seed + self.seeds - 1 > LARGEST_SEED:
+            raise ValueError(f"seed = {self.seed} with seeds = {self.seeds}: the largest seed is {LARGEST_SEED}")
         return self
 
 
-_HYPERPARAMETERS: dict[str, Any] = {name: (type(row.settings), row.settings) for name, row in ALGORITHMS.items()}
+_HYPERPARAMETERS: dict[str, Any] = {
+    name: (type(algorithm.settings), algorithm.settings) for name, algorithm in ALGORITHMS.items()
+}
+"""The class and the published values of each algorithm's hyperparameters: the type and the default of a field."""
 
 
 class Settings(create_model("_AlgorithmFields", __base__=_RunSettings[None], __module__=__name__, **_HYPERPARAMETERS)):
@@ -111,7 +114,7 @@ class Settings(create_model("_AlgorithmFields", __base__=_RunSettings[None], __m
     @model_validator(mode="before")
     @classmethod
     def _complete_hyperparameters(cls, values: Any) -> Any:
-        """Take hyperparameters that are not given from the algorithm, because names such as td3 and ddpg share a class."""
+        """Fill in the hyperparameters that are not given with those of the algorithm: names such as td3 and ddpg share a class."""
         if not isinstance(values, Mapping):
             return values
         completed = dict(values)
@@ -123,11 +126,6 @@ class Settings(create_model("_AlgorithmFields", __base__=_RunSettings[None], __m
             if isinstance(changes, Mapping):
                 completed[name] = {**dict(default), **changes}
         return completed
-
-
-def round_up(steps: int, iteration_steps: int) -> int:
-    """Round a number of steps up to whole iterations."""
-    return math.ceil(steps / iteration_steps) * iteration_steps
 
 
 class ResolvedSettings(_RunSettings[Never]):
@@ -147,7 +145,8 @@ class ResolvedSettings(_RunSettings[Never]):
         algorithm = info.data.get("algorithm")  # missing if it was not valid
         if algorithm is None or not isinstance(values, Mapping):
             return values
-        return type(ALGORITHMS[algorithm].settings).model_validate(values)
+        default = ALGORITHMS[algorithm].settings  # several algorithms share its class
+        return type(default).model_validate({**dict(default), **values})
 
     @model_validator(mode="after")
     def _check_multiples(self) -> "ResolvedSettings":
@@ -173,5 +172,5 @@ class ResolvedSettings(_RunSettings[Never]):
         return round_up(getattr(self.hyperparameters, "warmup", 0), self.iteration_steps)
 
     def choose_scored_observation(self, task: TaskSpec) -> ScoredObservation:
-        """Return which observations of a step phi reads."""
+        """Return which observations of a step factors and raw features are computed from."""
         return self.scored_observation or task.scored_observation

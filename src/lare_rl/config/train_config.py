@@ -49,8 +49,8 @@ class CreditConfig:
     """What the updates of the policy read. If it is only the newest steps, the replay holds what the decoders read, and no more."""
     masks_steps: bool = False
     """Whether decoders leave out single steps of an agent, as if it had left (`pure_credit`)."""
-    batched: bool = False
-    """Whether fits of several seeds are made at once, as on an accelerator. It changes their last bits.
+    vectorized: bool = False
+    """Whether several fits are computed in one `vmap`, as on an accelerator. It changes their last bits.
 
     On a CPU this is never faster by much. Besides, batched calls of LAPACK that run at the same time may wait for each other for ever
     (jaxlib 0.10, `ParallelBatchMap`)."""

@@ -170,15 +170,15 @@ def fit(
     max_rounds: int = MAX_EVIDENCE_ROUNDS,
     *,
     fixed_length: bool = False,
-    batched: bool = False,
+    vectorized: bool = False,
 ) -> ClosedForm:
     """Fit the decoder of each score type.
 
-    If `batched` is true, the score types sum and average are fitted in one batch, else one after the other. If the score is an
+    If `vectorized` is true, the score types sum and average are fitted in one batch, else one after the other. If the score is an
     average, and not all episodes have the same length (`fixed_length`), no step is paid for the mean return.
     """
     basis = state.decoder.basis
-    groups, strengths = _fit_linear_types(state, score_types, max_rounds, batched=batched)
+    groups, strengths = _fit_linear_types(state, score_types, max_rounds, vectorized=vectorized)
     weights = _linear_weights(basis, groups, strengths, _start_value_unit(state))
     if ScoreType.AVERAGE in score_types and not fixed_length:
         weights = _centre_average(state, weights, score_types.index(ScoreType.AVERAGE))
@@ -192,7 +192,7 @@ def fit(
 
 
 def _fit_linear_types(
-    state: ClosedForm, score_types: tuple[int, ...], max_rounds: int, *, batched: bool
+    state: ClosedForm, score_types: tuple[int, ...], max_rounds: int, *, vectorized: bool
 ) -> tuple[Posterior, Posterior]:
     """Return the fits by groups and by strengths of all score types but log odds, along a leading axis."""
     linear_types = [score_type for score_type in score_types if score_type != ScoreType.LOG_ODDS]
@@ -202,10 +202,10 @@ def _fit_linear_types(
         score_type, *earlier = args
         groups, strengths = jax.tree.map(lambda leaf: leaf.astype(float), earlier)
         statistics = _score_type_statistics(state, score_type)
-        return relevance.fit(statistics, score_type, *indices, groups, strengths, max_rounds, batched=batched)
+        return relevance.fit(statistics, score_type, *indices, groups, strengths, max_rounds, vectorized=vectorized)
 
     rows = jnp.asarray(linear_types), state.posterior, state.strengths
-    return map_leading_axis(fit_score_type, rows, batched=batched)
+    return map_leading_axis(fit_score_type, rows, vectorized=vectorized)
 
 
 def _score_type_statistics(state: ClosedForm, score_type: Int[Array, ""] | int) -> SufficientStatistics:

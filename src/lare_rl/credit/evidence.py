@@ -178,7 +178,7 @@ def fit(
     start: Posterior,
     max_rounds: int | Int[Array, ""],
     *,
-    batched: bool = False,
+    vectorized: bool = False,
 ) -> Posterior:
     """Return the posterior under the precisions that maximise the evidence.
 
@@ -196,13 +196,13 @@ def fit(
     Args:
         start: an earlier fit, whose precisions start the iteration, or `init_posterior`.
         max_rounds: the maximum number of rounds of each iteration.
-        batched: whether the three iterations run at once.
+        vectorized: whether the three iterations run at once.
     """
     problem = regression(statistics, score_type, alpha_index)
     few = ~problem.has_many_episodes
     limits = jnp.where(jnp.stack([jnp.array(True), start.has_fit & few, ~start.has_fit | few]), max_rounds, 1)
     starts = starting_precisions(problem, start)
-    candidates = map_leading_axis(lambda args: fixed_point(problem, *args), (*starts, limits), batched=batched)
+    candidates = map_leading_axis(lambda args: fixed_point(problem, *args), (*starts, limits), vectorized=vectorized)
     return unscale(statistics, problem, most_likely(candidates), fallback=start)
 
 

@@ -179,10 +179,10 @@ def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     return closed._replace(sufficient_statistics=closed_form.split_double(statistics), log_odds=log_odds)
 
 
-def fit_closed_form(state: DecoderState, spec: CreditSpec, *, batched: bool = False) -> DecoderState:
+def fit_closed_form(state: DecoderState, spec: CreditSpec, *, vectorized: bool = False) -> DecoderState:
     """Fit in closed form to all episodes that have been added, and determine the type of the score.
 
-    `batched` is as in `evidence.fit`. A state without a closed form is returned unchanged.
+    `vectorized` is as in `evidence.fit`. A state without a closed form is returned unchanged.
     """
     closed, score_types = state.closed_form, spec.score_types
     if closed is None:
@@ -190,7 +190,7 @@ def fit_closed_form(state: DecoderState, spec: CreditSpec, *, batched: bool = Fa
     if spec.method.fit is Fit.SIGNS:
         closed = closed_form.fit_signs(closed)
     else:
-        closed = closed_form.fit(closed, score_types, fixed_length=spec.fixed_length, batched=batched)
+        closed = closed_form.fit(closed, score_types, fixed_length=spec.fixed_length, vectorized=vectorized)
     state = state._replace(closed_form=closed)
     if state.score_type_predictions is not None:
         state = _choose_score_type(state, state.score_type_predictions, score_types)

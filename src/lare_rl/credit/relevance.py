@@ -35,7 +35,7 @@ def fit(
     earlier_strengths: Posterior,
     max_rounds: int,
     *,
-    batched: bool = False,
+    vectorized: bool = False,
 ) -> tuple[Posterior, Posterior]:
     """Return the fit by groups, and the fit with a precision for each strength, whether it is better than that by groups or not.
 
@@ -43,7 +43,7 @@ def fit(
     `earlier_strengths` are earlier results, or `evidence.init_posterior`. The iteration for the strengths starts from the precisions of
     the groups or, with `Regression.has_many_episodes`, from `earlier_strengths`.
     """
-    groups = evidence.fit(statistics, score_type, group_index, earlier_groups, max_rounds, batched=batched)
+    groups = evidence.fit(statistics, score_type, group_index, earlier_groups, max_rounds, vectorized=vectorized)
     if np.array_equal(group_index, strength_index):
         return groups, groups
     start = expand_groups(groups, group_index, strength_index)

@@ -45,7 +45,9 @@ def as_lare_error(message: str, error: BaseException, hint: str = "") -> LareErr
     if isinstance(error, LareError):
         return error
     logging.getLogger(__name__).debug("%s", message, exc_info=error)
-    text = " ".join(str(error).split()) or type(error).__name__
+    text = " ".join(str(error).split())
+    if not text or isinstance(error, KeyError):  # its text is only the key
+        text = f"{type(error).__name__} {text}".rstrip()
     return LareError(f"{message}: {abbreviate(text, MAX_ERROR)}{hint}")
 
 

@@ -46,7 +46,7 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
             return f" (for an environment of your own, write MODULE:{name}, where MODULE registers it)"
         if isinstance(error, gymnasium.error.NamespaceNotFound):
             hint = did_you_mean(name.partition("/")[0], FAMILIES)
-            return hint or " (for a family of a plugin, import the plugin's module, or name it in LARE_PLUGINS)"
+            return f"{hint} (for a family of a plugin, import the plugin's module, or name it in LARE_PLUGINS)"
         if "render_mode" in kwargs and "render_mode" in str(error):
             return ' (to be filmed, it must accept render_mode="rgb_array")'
         return import_hint(error)

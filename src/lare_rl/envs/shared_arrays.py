@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from lare_rl.envs.interface import EnvSpec, Timestep
 from lare_rl.envs.vec_env import empty_batch
+from lare_rl.util.rounding import round_up
 
 __all__ = ["SharedArrays", "map_arrays", "map_current", "open_shared_memory"]
 
@@ -67,7 +68,7 @@ def map_arrays(prefix: str, spec: EnvSpec, n: int) -> SharedArrays:
     batch = empty_batch(spec, n)
     action = np.zeros((n, spec.n_agents, spec.action_size), spec.action_dtype)
     arrays = [np.zeros(n, bool), np.zeros(n, np.int64), action, *batch[:-1], *batch.measures.values()]
-    starts = np.cumsum([0, *(-(-array.nbytes // 64) * 64 for array in arrays)])
+    starts = np.cumsum([0, *(round_up(array.nbytes, 64) for array in arrays)])
     memory = _map(prefix + "arrays", int(starts[-1]))
     where, seed, action, *columns = (
         np.ndarray(array.shape, array.dtype, memory, start)

@@ -32,7 +32,9 @@ class Match(NamedTuple):
 
 
 def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
-    """Let the first team of each run play against the second team of each: four matches, all from the same initial states.
+    """Let the first team of each run play against the second team of each: four matches.
+
+    The policies sample their actions. All matches have the same random numbers, and so the same initial states.
 
     Raises `LareError` if the runs differ in task or algorithm, or the task has other than two teams or is not in JAX.
     """

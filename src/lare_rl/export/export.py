@@ -47,8 +47,8 @@ class ExportResult(NamedTuple):
 def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, best: bool = False) -> ExportResult:
     """Write the policy and the reward functions of a seed to a directory.
 
-    The policy returns its most likely action. PPO and IPPO with discrete actions also return the logits. Rewards are those of the last
-    checkpoint's decoder, in the unit of the return (of `llm-reward`: as the function returns them).
+    The policy acts without noise: of choices, it returns the most likely one. PPO and IPPO with discrete actions also return the logits.
+    Rewards are those of the last checkpoint's decoder, in the unit of the return (of `llm-reward`: as the function returns them).
 
     Args:
         run: the run, or its directory.
@@ -88,9 +88,8 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
     origin = {"method": settings.method, "algorithm": settings.algorithm, "seed": run.seeds[seed_index], "step": step}
     with new_directory(out) as new:
         _write_files(new, graphs, {"lare": code_version(), "task": task.name, **origin, **descriptions})
-        if no_reward_reason is None:
-            for role, function in zip(task.roles, run.functions, strict=False):  # a method without phi has no functions
-                function.save(new / function_filename(task, role))
+        for role, function in zip(task.roles, run.functions, strict=False):  # a method without phi has no functions
+            function.save(new / function_filename(task, role))
     return ExportResult(out, tuple(graphs), no_reward_reason, onnx=is_onnx_installed())
 
 
@@ -134,7 +133,8 @@ def _write_arrays(path: Path, graph: Graph) -> None:
     arrays = {}
     for i, node in enumerate(graph.nodes):
         if node.op == "constant":
-            arrays[str(i)] = node.option.astype(np.float32) if node.kind == "float" else node.option
+            with np.errstate(over="ignore"):  # a large constant becomes inf, as in float32 arithmetic
+                arrays[str(i)] = node.option.astype(np.float32) if node.kind == "float" else node.option
         elif node.op == "gather" and node.option.slices is None:
             arrays[str(i)] = node.option.positions
     replace_npz(path, arrays)

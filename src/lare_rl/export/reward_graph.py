@@ -3,6 +3,7 @@
     before, after [batch *agents observation]       observations before and after a step
     action [batch *agents action]                   in the environment's units; a choice is a one-hot row
     length [batch], or [batch 1] if there are agents    T of the step's episode, if the score is a mean over its steps
+    alive [batch agents]                            which agents act, if the method shares rewards among agents that may leave
     ->  r_hat [batch *agents]
 
 The graph has only the inputs that the method uses. It contains phi, which scores each agent by itself. If credit is assigned by

@@ -51,10 +51,11 @@ class CreditReplayBuffer(ReplayBuffer):
     ):
         """Create an empty buffer. The algorithm does this; other arguments are those of Stable-Baselines3's buffer.
 
-        `credit` is the assigner, from `replay_buffer_kwargs`. It must keep at least `buffer_size` steps, which counts those of all
-        environments. The spaces are those of one environment.
+        `credit` is the assigner, from `replay_buffer_kwargs`. Its capacity must be at least `buffer_size`, the number of steps of all
+        environments together. The spaces are those of one environment.
 
-        Raises `LareError` if there is no assigner, if it is too small or was made for other spaces, or for the wrong class of buffer.
+        Raises `LareError` if there is no assigner, if it is too small or was made for other spaces or many agents, or if these
+        observations need another class of buffer.
         """
         name = type(self).__name__
         if credit is None:
@@ -68,7 +69,7 @@ class CreditReplayBuffer(ReplayBuffer):
             raise LareError(f"{name} cannot store observations of {observation_space}: {hint}")
         super().__init__(buffer_size, observation_space, action_space, *args, **kwargs)
         check_capacity(credit, self.buffer_size * self.n_envs)
-        # Those of the assigner; -1 if there is no step yet.
+        # The assigner's number of each step; -1 where there is no step yet.
         self.step_ids = np.full((self.buffer_size, self.n_envs), -1)
         self._attach_assigner(credit)
 
@@ -86,7 +87,10 @@ class CreditReplayBuffer(ReplayBuffer):
         done: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """Add one step of each environment, as Stable-Baselines3 gives it: Box actions between -1 and 1, nothing normalised."""
+        """Add one step of each environment, as Stable-Baselines3 gives it.
+
+        Box actions are scaled to [-1, 1]; observations and rewards are those before VecNormalize.
+        """
         env_action = action.reshape(self.n_envs, *(self.action_space.shape or ()))
         if isinstance(self.action_space, spaces.Box):
             low, high = self.action_space.low, self.action_space.high
@@ -181,36 +185,38 @@ class CreditCallback(BaseCallback):
         env_ids = [(id(self.model), env_index) for env_index in range(buffer.n_envs)]
         self._recorder = StepRecorder(self.credit, self.model.observation_space, self.model.action_space, env_ids)
         self.step_ids = []
-        if self.model.num_timesteps == 0:  # every environment was reset
-            for env_index in range(buffer.n_envs):
-                self._recorder.drop(env_index)
+        for env_index in np.flatnonzero(
+            self.model._last_episode_starts
+        ).tolist():  # it was reset, or its episode has ended
+            self._recorder.drop(env_index)
         self._observation = self._original_observation(self.model._last_obs)
-        # The algorithm calls this method between the rollout and the update. No callback is called there: PPO's `on_rollout_end` comes
-        # after it, and MaskablePPO and RecurrentPPO do not tell callbacks the last values before.
+        # r_hat must be added just before the algorithm computes advantages, where no callback is called. `on_rollout_end` comes after:
+        # advantages could be computed again there, but MaskablePPO and RecurrentPPO do not give callbacks the last values.
         buffer.compute_returns_and_advantage = self._compute_returns_and_advantage
 
     def _on_training_end(self) -> None:
         vars(self.model.rollout_buffer).pop("compute_returns_and_advantage", None)  # pyright: ignore[reportAttributeAccessIssue]
 
     def _on_step(self) -> bool:
-        normalize, rollout, done = self.model.get_vec_normalize_env(), self.locals, self.locals["dones"]
-        reward = rollout["rewards"] if normalize is None else normalize.get_original_reward()
-        observation = self._original_observation(rollout["new_obs"])
+        step, normalize = self.locals, self.model.get_vec_normalize_env()
+        done = step["dones"]
+        reward = step["rewards"] if normalize is None else normalize.get_original_reward()
+        observation = self._original_observation(step["new_obs"])
         next_observation = deepcopy(observation)
         for env_index in np.flatnonzero(done):
-            last = rollout["infos"][env_index].get("terminal_observation")
+            last = step["infos"][env_index].get("terminal_observation")
             if last is not None:
                 _set_row(next_observation, env_index, last if normalize is None else normalize.unnormalize_obs(last))
-        env_action = rollout.get("clipped_actions", rollout["actions"])  # MaskablePPO does not clip actions
+        env_action = step.get("clipped_actions", step["actions"])  # MaskablePPO does not clip actions
         transition = self._observation, env_action, next_observation
-        self.step_ids.append(self._recorder.add(*transition, reward, done, np.zeros_like(done), infos=rollout["infos"]))
+        self.step_ids.append(self._recorder.add(*transition, reward, done, np.zeros_like(done), infos=step["infos"]))
         self._observation = observation
         # The algorithm itself writes this array into its buffer, and adds gamma V(s') to it at time limits.
-        rollout["rewards"][:] = 0
+        step["rewards"][:] = 0
         return True
 
     def _compute_returns_and_advantage(self, last_values: Any, dones: np.ndarray) -> None:
-        """Replace the method of the rollout buffer while the model learns: add r_hat first."""
+        """Stand in for the rollout buffer's method of this name while the model learns: add r_hat, then call that method."""
         buffer: Any = self.model.rollout_buffer  # pyright: ignore[reportAttributeAccessIssue]
         step_ids, self.step_ids = self.step_ids, []
         if len(step_ids) == buffer.buffer_size:

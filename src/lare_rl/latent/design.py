@@ -75,7 +75,7 @@ def correct_until_passing(
             reply = recorder.ask("correct", request)
             result, errors = examine(reply)
     reason = f"none of {MAX_ATTEMPTS} attempts passed; the last one failed: {_summarise(errors)}"
-    raise DesignError(f"task {recorder.task!r}: {reason}", recorder)
+    raise DesignError(f"{recorder.task}: {reason}", recorder)
 
 
 def _summarise(errors: str) -> str:
@@ -145,7 +145,7 @@ class Conversation:
         attempt = self._examine(reply)
         if attempt.verdict.graph is None:
             reason = f"the reply cannot be read: {_summarise(attempt.verdict.errors)}"
-            raise DesignError(f"task {self.task.name!r}: {reason}", self.recorder)
+            raise DesignError(f"{self.task.name}: {reason}", self.recorder)
         return attempt._replace(verdict=Verdict((Check("read", True),), attempt.verdict.graph))
 
     def to_function(self, attempt: Attempt) -> LatentFunction:
@@ -199,8 +199,8 @@ def design(
         pre_verification: without it (the paper's ablation), the first function that can be read is accepted.
         record: the file to which every exchange is written, from the first reply on. It must not exist.
         on_message: called with messages about attempts.
-        steps: observations (n, observation size) and actions (n, action size) that functions are tried on if there is no
-            environment, as `lare_rl.logged_steps` reads them from a data set.
+        steps: observations (n, observation size) and actions (n, action size) that functions are tried on, instead of
+            random steps of the environment, as `lare_rl.logged_steps` reads them from a data set.
 
     Raises:
         DesignError: no attempt passed, or an error or Ctrl-C came after the first reply.

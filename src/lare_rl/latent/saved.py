@@ -61,7 +61,8 @@ def load_function(path: str | Path, task: TaskSpec | str | Path, steps: Steps | 
             - the .json file that `save` wrote beside a Python file of the same name,
             - a .json file with the whole reply of a language model to `lare-rl prompt`.
         task: the task of the function: a name, a path, or a spec.
-        steps: observations (n, observation size) and actions (n, action size) that it is tried on if there is no environment.
+        steps: observations (n, observation size) and actions (n, action size) that it is tried on, instead of random
+            steps of the environment.
 
     Raises:
         LareError: the file cannot be read, or the function does not pass for this task.

@@ -33,7 +33,7 @@ N_SAMPLE_STEPS = 256
 """The number of steps that a function is tried on."""
 
 _MAX_PLAYED_STEPS = 20 * N_SAMPLE_STEPS
-"""The most environment steps that are played for `N_SAMPLE_STEPS` steps of agents. Agents that have left have no steps."""
+"""The most environment steps that are played. Episodes may be long, and agents that have left have no steps."""
 
 Steps = tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, "_ _"]]
 """Inputs of a function: observations (n, observation size), and the actions of these steps (n, action size)."""
@@ -61,7 +61,7 @@ class Verdict:
     @property
     def passed(self) -> bool:
         """Whether every check has passed."""
-        return bool(self.checks) and all(check.passed for check in self.checks)
+        return all(check.passed for check in self.checks)
 
     @property
     def errors(self) -> str:
@@ -75,8 +75,8 @@ def verify(source: str, task: TaskSpec, kind: FunctionKind = "factors", steps: S
     Args:
         task: the task, which determines the sizes of observations and actions.
         kind: whether the function must return factors or one reward.
-        steps: observations (n, observation size) and actions (n, action size) that it is tried on if there is no environment;
-            256 steps are enough. Without them, it is tried on random steps of the task's environment.
+        steps: observations (n, observation size) and actions (n, action size) that it is tried on, at most 256 of them, evenly
+            spaced. The default is random steps of the task's environment.
 
     Raises:
         LareError: there is no such kind, the task's environment cannot be made, the steps do not have the task's sizes, or each
@@ -103,15 +103,15 @@ def _find_nonfinite_factor(
     rng = np.random.default_rng(list(hashlib.sha256(source.encode()).digest()))
     size, total = observation.shape[1], observation.shape[1] + action.shape[1]
     noise = [rng.standard_normal((N_SAMPLE_STEPS, n)).astype(np.float32) for n in (size, total - size)]
-    recorded = np.concatenate([observation, action], axis=1)
-    batches = {  # training may or may not contain them
-        "recorded steps": recorded,
-        "random steps": np.concatenate(noise, axis=1),
+    task_steps = np.concatenate([observation, action], axis=1)
+    batches = {  # the steps of the task, and others that training may reach
+        "steps of the task": task_steps,
+        "steps of random numbers": np.concatenate(noise, axis=1),
         "steps of nothing but zeros": np.zeros((1, total), np.float32),
         "steps of nothing but ones": np.ones((1, total), np.float32),
         "steps with a single one": np.eye(total, dtype=np.float32),
-        "recorded steps times 1000": np.concatenate([1000 * observation, action], axis=1),
-        "recorded steps times 1e-9": np.float32(1e-9) * recorded,
+        "steps of the task, with observations times 1000": np.concatenate([1000 * observation, action], axis=1),
+        "steps of the task times 1e-9": np.float32(1e-9) * task_steps,
     }
     for batch_name, steps in batches.items():
         factors = compute_batch(graph, steps[:, :size], steps[:, size:])
@@ -138,12 +138,12 @@ def _advice(graph: Graph, names: Sequence[str], factors: Float[np.ndarray, "step
         if not any(features_read[i].values()):
             yield f"factor {name!r} reads no entry of the observation or the action: it is the same for all steps"
         elif not varies[i]:
-            yield f"factor {name!r} never varies on the recorded steps"
+            yield f"factor {name!r} never varies on the steps that were tried"
     standardized = (factors[:, varies] - factors[:, varies].mean(axis=0)) / std[varies]
     correlations = np.abs(standardized.T @ standardized) / len(factors)
     varying = np.flatnonzero(varies).tolist()
     for i, j in np.argwhere(np.triu(correlations > 0.9999, 1)):
-        yield f"factor {names[varying[j]]!r} repeats {names[varying[i]]!r} on the recorded steps"
+        yield f"factor {names[varying[j]]!r} repeats {names[varying[i]]!r} on the steps that were tried"
 
 
 # --- steps to try a function on -----------------------------------------------------------------------------------------
@@ -153,7 +153,8 @@ def sample_steps(task: TaskSpec, steps: Steps | None) -> Steps:
     """Return the steps that a function of a task is tried on: at most 256 of `steps`, evenly spaced, or random steps.
 
     Raises:
-        LareError: as for `verify`.
+        LareError: each team of the task needs its own function, `steps` are not finite numbers of the task's sizes, or as for
+            `random_steps`.
     """
     role = require_role(task)
     if steps is None:
@@ -176,24 +177,21 @@ def sample_steps(task: TaskSpec, steps: Steps | None) -> Steps:
     return observation[selected], action[selected]
 
 
-def random_steps(task: TaskSpec, n_steps: int = N_SAMPLE_STEPS, seed: int = 0) -> Steps:
+@functools.lru_cache(maxsize=8)
+def random_steps(role: TaskSpec, n_steps: int = N_SAMPLE_STEPS) -> Steps:
     """Play episodes by uniformly random actions, and return steps of them (the paper's pre-collected state-action pairs).
 
     The task's `scored_observation` selects the observations before or after a step, or both: half of the rows are then
     observations before a step. If more steps were played than requested, the result is evenly spaced among them, from the first to the
     last. The arrays are cached, and therefore read-only.
+
+    Raises `LareError` if the environment cannot be made, or no agent acts.
     """
-    return _random_steps(task.model_dump_json(), n_steps, seed)
-
-
-@functools.lru_cache(maxsize=8)
-def _random_steps(task_json: str, n_steps: int, seed: int) -> Steps:
-    role = TaskSpec.model_validate_json(task_json)
     with contextlib.closing(make_host_env(role)) as env:
-        team, rng = env.spec.find_team(role.team), np.random.default_rng(seed)
+        team, rng = env.spec.find_team(role.team), np.random.default_rng(0)
         rows_by_side: list[list[list[np.ndarray]]] = [[] for _ in select_sides(role.scored_observation, 0, 1)]
-        n_rows, n_played, episode_seeds = 0, 0, itertools.count(seed)
-        # Episodes are played to their ends, because a function is tried on their last steps too.
+        n_rows, n_played, episode_seeds = 0, 0, itertools.count()
+        # Episodes are played to their ends, because a function is tried on their last steps too. Only a very long one is cut.
         while n_rows < n_steps and n_played < _MAX_PLAYED_STEPS:
             steps = play_steps(env, None, rng, next(episode_seeds))
             for timestep, env_action, next_timestep in itertools.islice(steps, _MAX_PLAYED_STEPS - n_played):

@@ -11,12 +11,12 @@ Rows = TypeVar("Rows")
 Result = TypeVar("Result")
 
 
-def map_leading_axis(function: Callable[[Rows], Result], rows: Rows, *, batched: bool) -> Result:
+def map_leading_axis(function: Callable[[Rows], Result], rows: Rows, *, vectorized: bool) -> Result:
     """Apply a function to each row of a pytree of arrays.
 
     Args:
         function: a function of one row.
         rows: arrays with the same leading axis.
-        batched: `jax.vmap`; else `jax.lax.map`, which is faster on a CPU.
+        vectorized: `jax.vmap`; else `jax.lax.map`, which is faster on a CPU.
     """
-    return jax.vmap(function)(rows) if batched else jax.lax.map(function, rows)
+    return jax.vmap(function)(rows) if vectorized else jax.lax.map(function, rows)

@@ -98,7 +98,8 @@ class _Writer:
 
     def constant(self, value: Any) -> str:
         array, name = np.asarray(value), f"constant_{len(self.constants)}"
-        typed = array.astype(DTYPES[KIND_OF_CODE[array.dtype.kind]])
+        with np.errstate(over="ignore"):  # a large constant becomes inf, as in float32 arithmetic
+            typed = array.astype(DTYPES[KIND_OF_CODE[array.dtype.kind]])
         self.constants.append(self.onnx.numpy_helper.from_array(typed, name))
         return name
 

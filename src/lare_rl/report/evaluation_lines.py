@@ -1,6 +1,5 @@
 """The lines of `lare-rl evaluate`: the returns of a run's policy, and those of random and of the most likely actions."""
 
-import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -25,6 +24,7 @@ from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.saved_state import load_actor
 from lare_rl.util.findings import format_for_reader
+from lare_rl.util.rounding import round_up
 from lare_rl.util.statistics import CLEAR_ERRORS, format_mean_std, format_plus_minus
 
 __all__ = ["describe_evaluation", "evaluation_lines"]
@@ -47,7 +47,7 @@ def evaluation_lines(
     best_steps = load_actor(run, best=True)[2].tolist() if best else None
     seeds, n_random = evaluation_seeds(run, episodes), max(episodes, RANDOM_EPISODES)
     if task.group is not None:  # every seed equally often, because groups may differ in their returns
-        n_random = len(seeds) * math.ceil(RANDOM_EPISODES / len(seeds))
+        n_random = round_up(RANDOM_EPISODES, len(seeds))
     random_episodes = play_random(task, n_random, max(policy_s, RANDOM_PLAY_LIMIT_S), make_listener(n_random), seeds)
     yield from describe_evaluation(run, evaluation, random_episodes, best_steps)
     if 0 < len(random_episodes[0]) < n_random:

@@ -5,6 +5,7 @@ latent_function.py   phi; its replies and checks are in latent_function.json. Se
 metrics.jsonl        see metrics_file.py
 checkpoint/          see checkpoint.py
 failed_batch.npz     the input of the latent function, if it failed
+lock                 locked by the process that trains the run
 """
 
 import contextlib
@@ -14,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lare_rl.config.settings import ResolvedSettings, round_up
+from lare_rl.config.settings import ResolvedSettings
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.function import LatentFunction, pair_with_roles
 from lare_rl.latent.saved import load_function, read_source
@@ -24,8 +25,9 @@ from lare_rl.runs.config_file import CONFIG, Config, make_config, read_config, w
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 from lare_rl.tasks.trust import check_trusted, trust_environment
-from lare_rl.util.files import check_writable, find_free_path, new_directory
+from lare_rl.util.files import check_writable, find_free_path, new_directory, report_write_error
 from lare_rl.util.processes import try_lock
+from lare_rl.util.rounding import round_up
 
 __all__ = [
     "CHECKPOINT",
@@ -38,6 +40,7 @@ __all__ = [
     "find_run_directories",
     "function_filename",
     "function_paths",
+    "function_suffix",
     "lock_run",
     "open_run",
     "open_without_functions",
@@ -57,12 +60,7 @@ class Run:
     directory: Path
     config: Config
     functions: tuple[LatentFunction, ...]
-    """One for each role of the task; empty for a method without phi."""
-
-    @property
-    def function(self) -> LatentFunction | None:
-        """The latent function of the first team, if the method has phi."""
-        return self.functions[0] if self.functions else None
+    """One for each role of the task; empty for a method without phi, and for a run from `open_without_functions`."""
 
     @property
     def graphs(self) -> tuple[Graph, ...]:
@@ -79,7 +77,7 @@ class Run:
 
     @property
     def scored_observation(self) -> ScoredObservation:
-        """Which observations of a step phi reads: before it, after it, or both."""
+        """Which observations of a step factors and raw features are computed from: before the action, after it, or both."""
         return self.config.settings.choose_scored_observation(self.config.task)
 
     def seed_index(self, seed: int | None) -> int:
@@ -94,7 +92,10 @@ class Run:
         return (self.checkpoint / STATE_FILE).exists()
 
     def metrics(self) -> list[dict[str, Any]]:
-        """Return every complete line of metrics.jsonl, in order."""
+        """Return every complete line of metrics.jsonl, in order. The lines are shared: do not change them.
+
+        Raises `LareError` if the file is damaged.
+        """
         return read_metrics(self.directory)
 
 
@@ -142,7 +143,7 @@ def extend_run(run: Run, steps: int) -> Run:
 def open_run(directory: str | Path) -> Run:
     """Open a run directory. Its latent functions are verified again.
 
-    Raises `LareError` if it is not a run, a file is not valid, or its environment is in a file that the user does not trust.
+    Raises `LareError` if it is not a run, a file is not valid, or the user does not trust its environment (`check_trusted`).
     """
     directory = Path(directory)
     config = read_config(directory)
@@ -152,7 +153,7 @@ def open_run(directory: str | Path) -> Run:
 
 
 def open_without_functions(directory: Path) -> Run:
-    """Open a run for its settings and metrics alone. Raises `LareError` like `read_config`."""
+    """Open a run for its settings and metrics alone: `functions` is empty. Raises `LareError` like `read_config`."""
     return Run(directory, read_config(directory), ())
 
 
@@ -218,8 +219,11 @@ def lock_run(run: Run) -> Iterator[None]:
         RunBusyError: another process trains in it.
         LareError: nothing can be written there.
     """
-    check_writable(run.directory / "lock")
-    with (run.directory / "lock").open("wb") as file:
+    path = run.directory / "lock"
+    check_writable(path)
+    with report_write_error(path):
+        file = path.open("wb")
+    with file:
         if not try_lock(file):
             raise RunBusyError(f"another process is training in {run.directory}")
         yield
@@ -228,16 +232,16 @@ def lock_run(run: Run) -> Iterator[None]:
 def find_run_directories(paths: Sequence[Path]) -> list[Path]:
     """Return the runs among some paths and up to two levels below them, in the order of the paths, each once.
 
-    The log that a sweep writes next to the directory of a run is skipped, so `DIRECTORY/*` may be passed: beside other paths, also the
-    log of a run that never began.
+    Logs that a sweep writes beside its runs are skipped, so that `DIRECTORY/*` may be passed. The log of a run that never began is
+    skipped unless it is the only path.
 
     Raises `LareError` if there is no path, or a path contains no run.
     """
     directories: dict[Path, Path] = {}  # by resolved path
     for path in paths:
-        if path.suffix == ".log" and (path.with_suffix("").is_dir() or (path.is_file() and len(paths) > 1)):
+        if path.suffix == ".log" and path.is_file() and (len(paths) > 1 or path.with_suffix("").is_dir()):
             continue
-        # A name that begins with a dot is the directory of a run that was killed before it was complete.
+        # The directory of a run that was killed while it was created has a name that begins with a dot.
         configs = [config for depth in ("", "[!.]*/", "[!.]*/[!.]*/") for config in path.glob(depth + CONFIG)]
         if not configs:
             hint = "; give the directory of a run (lare-rl compare also reads .csv files: docs/how-to/sweeps.md)"

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BeforeValidator, ConfigDict, Field, JsonValue, StrictInt, field_validator, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, StrictInt, field_validator, model_validator
 
 from lare_rl.errors import CheckedModel, Count, LareError
 from lare_rl.tasks.payments import PaymentRule
@@ -85,11 +85,14 @@ def _number_to_paid_steps(value: Any) -> Any:
     return {"steps": value} if type(value) is int else value
 
 
-def _tuples_to_lists(value: Any) -> Any:
-    """Return arguments as the file of a run stores them, which has no tuples."""
-    if isinstance(value, dict):
-        return {key: _tuples_to_lists(item) for key, item in value.items()}
-    return [_tuples_to_lists(item) for item in value] if isinstance(value, list | tuple) else value
+def _to_json(value: Any) -> Any:
+    """Return arguments as the file of a run stores them: with lists instead of tuples. Raises `ValueError` if JSON cannot."""
+    try:
+        return json.loads(json.dumps(value, allow_nan=False))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(
+            f"cannot be stored as JSON ({error}). Use numbers, texts, true or false, lists and tables."
+        ) from None
 
 
 class TaskSpec(CheckedModel):
@@ -139,7 +142,7 @@ class TaskSpec(CheckedModel):
     hangs or changes the first."""
     timeout: Annotated[float, Field(gt=0)] = 120.0
     """Time (s) within which an environment in another process must reply; else the run stops with a message."""
-    arguments: Annotated[dict[str, JsonValue], BeforeValidator(_tuples_to_lists)] = Field(default_factory=dict)
+    arguments: Annotated[dict[str, Any], BeforeValidator(_to_json)] = Field(default_factory=dict)
     """Keyword arguments of the environment, for families that take them, such as `pettingzoo/...` and `gymnax/...`."""
     agents: tuple[str, ...] = ()
     """Names of the agents that this file describes, or patterns such as `prey_*`. By default all. For environments whose agents

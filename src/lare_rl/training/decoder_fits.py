@@ -93,7 +93,7 @@ def _update_decoder(
     """Take one gradient step. The gradient of a large batch of equally long episodes is computed in chunks."""
     n_rows, n_episodes = batch.inputs[..., 0].size, len(batch.length)
     n_chunks = 1
-    if not config.batched and config.has_fixed_segments and n_rows > CHUNK_ROWS:
+    if not config.vectorized and config.has_fixed_segments and n_rows > CHUNK_ROWS:
         chunk_episodes = max(1, CHUNK_ROWS * n_episodes // n_rows)
         chunk_counts = range(-(-n_episodes // chunk_episodes), n_episodes + 1)
         n_chunks = next(n for n in chunk_counts if n_episodes % n == 0)
@@ -109,7 +109,7 @@ def fit_seeds(learner: Learner, keys: Key[Array, " seeds"], config: CreditConfig
     """Update the decoders of every seed `fit_updates` times. Return the mean of each metric."""
     # On a CPU, one seed after the other: a batch of one seed fills the caches already.
     decoders, metrics = map_leading_axis(
-        lambda pair: fit_repeatedly(*pair, config), (learner, keys), batched=config.batched
+        lambda pair: fit_repeatedly(*pair, config), (learner, keys), vectorized=config.vectorized
     )
     return learner._replace(decoders=decoders), metrics
 

@@ -3,7 +3,7 @@
 In this order, `credit/return_r2` is measured on returns before anything is fitted to them.
 
 `learn_returns` is written for all seeds: steps are read in lockstep, and closed-form fits are made when they are due, of all seeds at
-once or of one after the other (`batched`). Call it within `float64()`, because `closed_form.py` needs float64.
+once or of one after the other (`vectorized`). Call it within `float64()`, because `closed_form.py` needs float64.
 """
 
 from collections.abc import Callable
@@ -98,7 +98,7 @@ def _learn_if_due(
         closed = jax.lax.cond(jnp.any(is_stale), rebuild, lambda unchanged, *_: unchanged, *inputs)
     return tuple(
         _fit_seeds(
-            decoder._replace(closed_form=team), is_due & jax.vmap(closed_form.is_due)(team), spec, config.batched
+            decoder._replace(closed_form=team), is_due & jax.vmap(closed_form.is_due)(team), spec, config.vectorized
         )
         for decoder, team, spec in zip(decoders, closed, config.credit_specs, strict=True)
     )
@@ -166,12 +166,14 @@ def _rebuild_sums(
     return select(is_stale, rebuilt, closed)
 
 
-def _fit_seeds(decoder: DecoderState, is_due: Bool[Array, " seeds"], spec: CreditSpec, batched: bool) -> DecoderState:
+def _fit_seeds(
+    decoder: DecoderState, is_due: Bool[Array, " seeds"], spec: CreditSpec, vectorized: bool
+) -> DecoderState:
     """Make the closed-form fits of a team's decoder for the seeds that are due."""
-    fit = partial(learning.fit_closed_form, spec=spec, batched=batched)
+    fit = partial(learning.fit_closed_form, spec=spec, vectorized=vectorized)
 
     def fit_seed(seed: tuple[DecoderState, Bool[Array, ""]]) -> DecoderState:
         decoder, is_due = seed
         return jax.lax.cond(is_due, fit, lambda unchanged: unchanged, decoder)
 
-    return map_leading_axis(fit_seed, (decoder, is_due), batched=batched)
+    return map_leading_axis(fit_seed, (decoder, is_due), vectorized=vectorized)

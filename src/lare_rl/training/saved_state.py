@@ -39,7 +39,7 @@ class SavedState(NamedTuple):
 def make_run_config(run: Run, n_devices: int = 1) -> TrainConfig:
     """Return the configuration of a run on this machine, with its seeds spread over `n_devices` devices."""
     config = make_train_config(run.config.task, run.config.settings, run.functions, n_devices)
-    return replace(config, batched=config.method.fit is not None and jax.default_backend() != "cpu")
+    return replace(config, vectorized=config.method.fit is not None and jax.default_backend() != "cpu")
 
 
 def load_learner(run: Run, n_devices: int = 1) -> SavedState:

@@ -233,7 +233,7 @@ class Session:
             means = deterministic.returns.mean(axis=1)
             teams = self.config.env.teams
             metrics |= team_metrics([{DETERMINISTIC_RETURN: means[:, i]} for i in range(len(teams))], teams)
-        if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
+        if self.step > self.settings.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
             metrics[ACTOR_SATURATION] = saturation(greedy_actions(actor, self.learner.replay, self.config))
         check_losses(self.latest_metrics, self.run.seeds, self.step)
         return metrics_lines(self.run.seeds, self.step, metrics, rate)
@@ -327,7 +327,7 @@ def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Ses
     """Compile the functions of a session and make its environments. Without a learner, start with an untrained one."""
     task, n_seeds = run.config.task, len(run.seeds)
     env = make_jax_env(task) if config.env.is_jax else None
-    if env is not None and config.batched:
+    if env is not None and config.vectorized:
         n_envs = config.n_envs * n_seeds // config.n_devices
         config = replace(config, resets_with_steps=is_reset_cheap(env, n_envs))
     iterates_on_host = env is None or config.has_first_fit

@@ -26,10 +26,8 @@ from jaxtyping import Float, Int
 from lare_rl.credit.precisions import JITTER, NUMPY_BACKEND, TOLERANCE, Moments, Posterior, Regression, varies
 
 __all__ = [
-    "Elimination",
     "GroupSums",
     "PrefixFit",
-    "eliminate_groups",
     "fit_linear",
     "fixed_point",
     "group_moments",
@@ -120,7 +118,7 @@ def sum_up(
     return GroupSums(x_mean=x_mean, group_x=group_x, group_y=group_y, group_weight=group_weight, problem=problem)
 
 
-class Elimination(NamedTuple):
+class _Elimination(NamedTuple):
     """The posterior of (v, m), and of b if (v, m) is known. y is in units of its standard deviation, and m relative to its mean."""
 
     root: Float[np.ndarray, "v_and_m v_and_m"]
@@ -139,7 +137,7 @@ class Elimination(NamedTuple):
         return np.concatenate([np.sum(self.root[:, :-1] ** 2, axis=0), group_variance])
 
 
-def eliminate_groups(sums: GroupSums, alpha: Float[np.ndarray, " alphas"], beta: float) -> Elimination:
+def _eliminate_groups(sums: GroupSums, alpha: Float[np.ndarray, " alphas"], beta: float) -> _Elimination:
     """Return the posterior under some precisions. D and B are those of the equations above."""
     problem, n = sums.problem, len(sums.x_mean)
     d = beta * sums.group_weight + alpha[-1]
@@ -153,14 +151,14 @@ def eliminate_groups(sums: GroupSums, alpha: Float[np.ndarray, " alphas"], beta:
     intercept = beta * sums.group_y / d - group_row @ weight
     # The flat prior of m is integrated out: that takes the precision of m itself from the determinant.
     log_det = log_det + np.log(d).sum() - np.log(beta * problem.q)
-    return Elimination(
+    return _Elimination(
         root=root, log_det=log_det, weight=weight, intercept=intercept, group_row=group_row, group_precision=d
     )
 
 
 def group_moments(sums: GroupSums, alpha: Float[np.ndarray, " alphas"], beta: float) -> Moments:
     """Return the moments of (v, b), as `precisions.dense_moments` of the whole matrix S would."""
-    problem, posterior = sums.problem, eliminate_groups(sums, alpha, beta)
+    problem, posterior = sums.problem, _eliminate_groups(sums, alpha, beta)
     v, b = posterior.weight[:-1], posterior.intercept
     weight = np.concatenate([v, b])
     squares = v @ problem.s @ v + 2 * b @ (sums.group_x @ v)
@@ -187,7 +185,7 @@ def fit_linear(
     candidates = [fixed_point(sums, problem.equal_alpha * factor, beta) for factor in (1.0, NOISE_ONLY)]
     best = max(candidates, key=lambda posterior: posterior.log_evidence)
     alpha, beta = NUMPY_BACKEND.clip_precisions(problem, best.alpha, best.beta)
-    posterior, unit = eliminate_groups(sums, alpha, beta), float(problem.y_std)
+    posterior, unit = _eliminate_groups(sums, alpha, beta), float(problem.y_std)
     return PrefixFit(
         x_mean=sums.x_mean,
         weight=unit * posterior.weight[:-1],

@@ -80,7 +80,12 @@ def new_directory(directory: Path) -> Iterator[Path]:
     try:
         with report_write_error(directory):
             new.mkdir(parents=True)
-            yield new
+            try:
+                yield new
+            except LareError as error:
+                if isinstance(error.__cause__, OSError):  # its message names a file in `new`, whose path nobody knows
+                    raise error.__cause__ from None
+                raise
             new.rename(directory)
     finally:
         shutil.rmtree(new, ignore_errors=True)
