@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BeforeValidator, ConfigDict, Field, StrictInt, field_validator, model_validator
 
-from lare_rl.errors import CheckedModel, Count, LareError
+from lare_rl.errors import CheckedModel, Count, LareError, short_repr
 from lare_rl.tasks.payments import PaymentRule
 
 __all__ = [
@@ -87,12 +88,15 @@ def _number_to_paid_steps(value: Any) -> Any:
 
 def _to_json(value: Any) -> Any:
     """Return arguments as the file of a run stores them: with lists instead of tuples. Raises `ValueError` if JSON cannot."""
-    try:
-        return json.loads(json.dumps(value, allow_nan=False))
-    except (TypeError, ValueError, RecursionError) as error:
+    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+        return {key: _to_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_to_json(item) for item in value]
+    if value is not None and not (isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value))):
         raise ValueError(
-            f"cannot be stored as JSON ({error}). Use numbers, texts, true or false, lists and tables."
-        ) from None
+            f"{short_repr(value)} cannot be stored as JSON. Use finite numbers, texts, booleans, lists and tables with texts as keys."
+        )
+    return value
 
 
 class TaskSpec(CheckedModel):
