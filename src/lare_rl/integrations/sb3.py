@@ -185,9 +185,8 @@ class CreditCallback(BaseCallback):
         env_ids = [(id(self.model), env_index) for env_index in range(buffer.n_envs)]
         self._recorder = StepRecorder(self.credit, self.model.observation_space, self.model.action_space, env_ids)
         self.step_ids = []
-        for env_index in np.flatnonzero(
-            self.model._last_episode_starts
-        ).tolist():  # it was reset, or its episode has ended
+        starts: Any = self.model._last_episode_starts
+        for env_index in np.flatnonzero(starts).tolist():  # it was reset, or its episode has ended
             self._recorder.drop(env_index)
         self._observation = self._original_observation(self.model._last_obs)
         # r_hat must be added just before the algorithm computes advantages, where no callback is called. `on_rollout_end` comes after:
