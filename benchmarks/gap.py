@@ -2,27 +2,24 @@
 
     python benchmarks/gap.py
 
-It reads `results/`, writes `docs/pictures/gap.svg` and prints the first table of `docs/results/README.md`. The share of a run is
+It reads `results/`, writes `docs/pictures/gap.svg` and prints the first two tables of `docs/results/README.md`. The share of a run is
 (return - total at the end) / (true rewards - total at the end), with means over seeds as the two references. A seed that was trained
 several times counts once, with the mean of its runs. Intervals are those of 95% by a bootstrap over tasks and over seeds, of the
 references too. A task has a share if its gap is larger than two standard errors.
 """
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
-from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from headline import COMPARISONS, THREE_SEEDS, Comparison, Seeds, Sources, read_scores, seed_means
 from lare_rl.report.figures import COLOURS, add_white_background, to_svg
 
-RESULTS = Path(__file__).parent / "results"
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "gap.svg"
 RAW, PAPER, DEFAULT = "best published decoder of raw features", "LaRe with the paper's decoder", "lare-bayes"
 METHODS = (RAW, PAPER, DEFAULT)
@@ -31,191 +28,8 @@ REPETITIONS = 10_000
 WIDEST = (-0.5, 3.0)
 """The shares that the picture shows."""
 
-Directories = Sequence[str]
-"""Runs of one method, with the same seeds or others."""
-Seeds = Float[np.ndarray, " seeds"]
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A task, and the kept runs of each method."""
-
-    steps: int
-    episodic: Directories = ()
-    dense: Directories = ()
-    raw: Mapping[str, Directories] = field(default_factory=dict)
-    """The candidates for the best decoder of raw features."""
-    paper: Directories = ()
-    default: Directories = ()
-    without_phi: Directories = ()
-    """The default's fit of raw entries, where it was trained. It is in the table only."""
-    metric: str = "evaluation/return"
-    in_mean: bool = True
-    """Whether the mean over tasks has it. A task counts once, with the most seeds."""
-
-
-LEARNING, SWEEP, GPU = "learning", "sweeps/closed-form", "closed-form-gpu"
-LAPTOP, FULL, WHY = "reproduce/laptop", "sweeps/closed-form-full", "why"
-PUBLISHED, WHOLE_EPISODE, OWN_DELAY = "-published", "-whole-episode", "-own-delay"
-"""Endings of runs of `lare-rl reproduce real`: see `benchmarks/real/study.toml`."""
 STYLE: Any = {"font.family": "sans-serif", "font.size": 11, "svg.fonttype": "none", "svg.hashsalt": "lare"}
 """Of pictures."""
-
-
-def particles(task: str) -> Comparison:
-    """A particle task of the paper."""
-    return Comparison(
-        2_050_000,
-        [f"{LAPTOP}/{task}/episodic-ippo"],
-        [f"{LAPTOP}/{task}/dense-ippo"],
-        {method: [f"{LAPTOP}/{task}/{method}-ippo"] for method in ("rd", "rrd", "arel", "stas")},
-        [f"{LAPTOP}/{task}/lare-rd-ippo-draw0"],
-        [f"{FULL}/{task}/lare-bayes-ippo-draw0"],
-        metric="evaluation/summed_return",
-    )
-
-
-def hidden(task: str) -> Comparison:
-    """A score that the texts of the task do not describe."""
-    return Comparison(
-        60_000,
-        raw={"rrdu": [f"{LAPTOP}/{task}/rrdu-td3", f"{WHY}/{task}/rrdu-on-a-gpu"]},
-        paper=[f"{LAPTOP}/{task}/lare-rrdu-td3-draw0", f"{WHY}/{task}/lare-rrdu-on-a-gpu"],
-        default=[f"{LAPTOP}/{task}/lare-bayes-td3-draw0", f"{GPU}/{task}/lare-bayes"],
-    )
-
-
-def simulator_runs(task: str, algorithm: str, method: str, ending: str = "") -> Directories:
-    """The runs of a method on a simulator: seeds 0 to 4, and 5 to 9."""
-    environment = f"{task}Proxy" if method == "dense" and ending != OWN_DELAY else task
-    return [f"{LAPTOP}/real/seeds-{first}/{environment}/{method}-{algorithm}{ending}" for first in (0, 5)]
-
-
-def simulator(task: str, algorithm: str, steps: int, episodic: str = "", dense: str = "") -> Comparison:
-    """A simulator whose score exists only at the end. A dense proxy of the score takes the place of true rewards.
-
-    Args:
-        episodic, dense: the endings of the runs of the two references. They name the setting with the highest scores.
-    """
-    return Comparison(
-        steps,
-        simulator_runs(task, algorithm, "episodic", episodic),
-        simulator_runs(task, algorithm, "dense", dense),
-        {"rrdu": simulator_runs(task, algorithm, "rrdu")},
-        simulator_runs(task, algorithm, "lare-rrdu", PUBLISHED),
-        simulator_runs(task, algorithm, "lare-bayes"),
-        simulator_runs(task, algorithm, "bayes"),
-    )
-
-
-def ten_seeds(study: str, task: str, raw: Sequence[str]) -> Comparison:
-    """A task of a sweep of ten seeds and 30,000 steps, and its candidates for the best decoder of raw features."""
-
-    def runs(method: str) -> Directories:
-        return [f"sweeps/{study}/{task}/{method}-td3"]
-
-    return Comparison(
-        30_000,
-        runs("episodic"),
-        runs("dense"),
-        {method: runs(method) for method in raw},
-        [f"sweeps/{study}/{task}/lare-rrdu-td3-draw0"],
-        [f"sweeps/{study}/{task}/lare-bayes-td3-draw0"],
-        runs("bayes"),
-    )
-
-
-HALF_CHEETAH, WALKER, REACHER, TARGET = "HalfCheetah-v4", "Walker2d-v4", "Reacher-v4", "HalfCheetahTarget-v4"
-TEN_SEEDS = "scores/cheetah/HalfCheetah-v4,paidonce"
-THRESHOLD = "scores/threshold/HalfCheetahThreshold-v4"
-COMPARISONS = {
-    "wheat, SAC": simulator("Wheat", "sac", 6_000),
-    "traffic, PPO": simulator("Traffic", "ppo", 36_000, WHOLE_EPISODE),
-    "job shop, PPO": simulator("JobShop", "ppo", 100_000, WHOLE_EPISODE, WHOLE_EPISODE),
-    "power grid, PPO": simulator("Grid", "ppo", 30_720),
-    "trains, IPPO": simulator("Trains", "ippo", 60_000),
-    f"{HALF_CHEETAH}, TD3, short": Comparison(
-        30_000,
-        [f"{TEN_SEEDS}/episodic"],
-        [f"{TEN_SEEDS}/dense"],
-        {method: [f"{TEN_SEEDS}/{method}"] for method in ("rrdu", "lrr", "grd", "rudder")},
-        [f"{TEN_SEEDS}/lare-rrdu"],
-        [f"{TEN_SEEDS}/lare-bayes"],
-        [f"{TEN_SEEDS}/bayes"],
-    ),
-    f"{REACHER}, TD3": ten_seeds("headline", REACHER, ("rrdu",)),
-    f"{TARGET}, TD3": ten_seeds("headline", TARGET, ("rrdu",)),
-    "HalfCheetahThreshold-v4, TD3": Comparison(
-        60_000,
-        [f"{THRESHOLD}/episodic"],
-        [f"{THRESHOLD}/dense"],
-        {"rrdu": [f"{THRESHOLD}/rrdu"]},
-        [f"{THRESHOLD}/lare-rrdu"],
-        default=[f"{THRESHOLD}/lare-bayes"],
-    ),
-    f"{HALF_CHEETAH}, TD3": Comparison(
-        100_000,
-        [f"{LEARNING}/{HALF_CHEETAH}/episodic"],
-        [f"{LEARNING}/{HALF_CHEETAH}/dense", f"{SWEEP}/{HALF_CHEETAH}/dense-td3", f"{GPU}/{HALF_CHEETAH}/dense"],
-        {
-            "rrdu": [f"{LEARNING}/{HALF_CHEETAH}/rrdu"],
-            "rd": [f"{LEARNING}/{HALF_CHEETAH}/rd"],
-            "rrd": [f"{SWEEP}/{HALF_CHEETAH}/rrd-td3"],
-        },
-        [
-            f"{LEARNING}/{HALF_CHEETAH}/lare-rrdu",
-            f"{SWEEP}/{HALF_CHEETAH}/lare-rrdu-td3-draw0",
-            f"{GPU}/{HALF_CHEETAH}/lare-rrdu",
-        ],
-        [f"{SWEEP}/{HALF_CHEETAH}/lare-bayes-td3-draw0", f"{GPU}/{HALF_CHEETAH}/lare-bayes"],
-        [f"{GPU}/{HALF_CHEETAH}/bayes"],
-        in_mean=False,
-    ),
-    f"{WALKER}, TD3": Comparison(
-        50_000,
-        [f"{LAPTOP}/{WALKER}/episodic-td3"],
-        [f"{LEARNING}/{WALKER}/dense", f"{SWEEP}/{WALKER}/dense-td3"],
-        {
-            "rrdu": [f"{LEARNING}/{WALKER}/rrdu"],
-            "rd": [f"{LAPTOP}/{WALKER}/rd-td3", f"{SWEEP}/{WALKER}/rd-td3"],
-            "rrd": [f"{LAPTOP}/{WALKER}/rrd-td3"],
-        },
-        [f"{LEARNING}/{WALKER}/lare-rrdu"],
-        [f"{SWEEP}/{WALKER}/lare-bayes-td3-draw0", f"{GPU}/{WALKER}/lare-bayes"],
-        [f"{GPU}/{WALKER}/bayes"],
-    ),
-    "PP-6, IPPO": particles("PP-6"),
-    "SMAX-2s3z, QMIX": Comparison(
-        200_000,
-        [f"{LAPTOP}/SMAX-2s3z/episodic-qmix"],
-        [f"{LAPTOP}/SMAX-2s3z/dense-qmix"],
-        {method: [f"{LAPTOP}/SMAX-2s3z/{method}-qmix"] for method in ("rd", "rrd", "rrdu")},
-        [f"{LAPTOP}/SMAX-2s3z/lare-rd-qmix-draw0"],
-        metric="evaluation/won",
-    ),
-    "CN-6, IPPO": particles("CN-6"),
-    "TriangleArea, IPPO": particles("TriangleArea"),
-    "HalfCheetahFoot-v4, TD3": hidden("HalfCheetahFoot-v4"),
-    "HalfCheetahSaturating-v4, TD3": hidden("HalfCheetahSaturating-v4"),
-}
-
-
-def read_scores(directories: Directories, comparison: Comparison) -> dict[int, list[float]]:
-    """The scores of each seed, one for each run, at the step of the comparison."""
-    scores: dict[int, list[float]] = {}
-    for directory in directories:
-        lines = map(json.loads, (RESULTS / directory / "metrics.jsonl").read_text().splitlines())
-        for line in lines:
-            if line["step"] == comparison.steps:
-                scores.setdefault(line["seed"], []).append(line[comparison.metric])
-        if not scores:
-            raise SystemExit(f"{directory} has no step {comparison.steps}")
-    return scores
-
-
-def seed_means(directories: Directories, comparison: Comparison) -> Seeds:
-    scores = read_scores(directories, comparison)
-    return np.array([np.mean(scores[seed]) for seed in sorted(scores)])
 
 
 def best_raw(comparison: Comparison) -> str:
@@ -223,7 +37,7 @@ def best_raw(comparison: Comparison) -> str:
     return max(comparison.raw, key=lambda method: float(np.mean(seed_means(comparison.raw[method], comparison))))
 
 
-def method_runs(comparison: Comparison) -> dict[str, Directories]:
+def method_runs(comparison: Comparison) -> dict[str, Sources]:
     return {
         RAW: comparison.raw[best_raw(comparison)] if comparison.raw else (),
         PAPER: comparison.paper,
@@ -231,15 +45,15 @@ def method_runs(comparison: Comparison) -> dict[str, Directories]:
     }
 
 
-def cell(directories: Directories, comparison: Comparison) -> str:
-    """Mean and standard deviation over all runs, with the number of seeds, and of runs if there are more."""
-    if not directories:
+def cell(sources: Sources, comparison: Comparison) -> str:
+    """Mean and standard deviation over all runs, and their number if there are several for a seed."""
+    if not sources:
         return "-"
-    scores = read_scores(directories, comparison)
+    scores = read_scores(sources, comparison)
     runs = [score for values in scores.values() for score in values]
     digits = 0 if np.std(runs) > 40 else 1 if np.std(runs) > 1 else 2
-    count = f"{len(scores)}" if len(runs) == len(scores) else f"{len(scores)}, {len(runs)} runs"
-    return f"{np.mean(runs):,.{digits}f} ± {np.std(runs, ddof=1):,.{digits}f} ({count})"
+    count = "" if len(runs) == len(scores) else f" ({len(runs)} runs)"
+    return f"{np.mean(runs):,.{digits}f} ± {np.std(runs, ddof=1):,.{digits}f}{count}"
 
 
 def has_gap(comparison: Comparison) -> bool:
@@ -355,25 +169,29 @@ def draw(rows: Mapping[str, Mapping[str, tuple[float, float, float]]]) -> str:
     return add_white_background(to_svg(figure))
 
 
-def main() -> None:
-    """Draw the picture and print the table."""
-    for name, comparison in COMPARISONS.items():
+def print_table(comparisons: Mapping[str, Comparison]) -> None:
+    for name, comparison in comparisons.items():
         cells = [f"{name}, {comparison.steps:,}"]
         runs = method_runs(comparison)
         raw = f"{cell(runs[RAW], comparison)}, `{best_raw(comparison)}`" if runs[RAW] else "-"
         cells += [cell(comparison.episodic, comparison), raw]
         columns = comparison.without_phi, runs[PAPER], runs[DEFAULT], comparison.dense
-        cells += [cell(directories, comparison) for directories in columns]
+        cells += [cell(sources, comparison) for sources in columns]
         print(f"| {' | '.join(cells)} |")
-    rows, complete = {}, []
-    for name, comparison in COMPARISONS.items():
-        if has_gap(comparison):
-            methods = [method for method, runs in method_runs(comparison).items() if runs]
-            number = {len(seed_means(method_runs(comparison)[method], comparison)) for method in methods}
-            label = f"{name}\n{comparison.steps:,} steps, n = {max(number)} seeds"
-            rows[label] = {method: estimate_share([comparison], method) for method in methods}
-            complete += [comparison] if len(methods) == len(METHODS) and comparison.in_mean else []
-    label = f"interquartile mean\nof the {len(complete)} tasks with all three"
+    print()
+
+
+def main() -> None:
+    """Draw the picture and print the tables."""
+    print_table(COMPARISONS)
+    print_table(THREE_SEEDS)
+    with_gap = {name: comparison for name, comparison in COMPARISONS.items() if has_gap(comparison)}
+    rows = {
+        f"{name}\n{comparison.steps:,} steps": {method: estimate_share([comparison], method) for method in METHODS}
+        for name, comparison in with_gap.items()
+    }
+    complete = list(with_gap.values())
+    label = f"interquartile mean\nof {len(complete)} tasks, 10 seeds each"
     rows[label] = {method: estimate_share(complete, method) for method in METHODS}
     for name, estimates in rows.items():
         texts = [f"{method} {value:.2f} [{low:.2f}, {high:.2f}]" for method, (value, low, high) in estimates.items()]

@@ -18,7 +18,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import wilcoxon
 
-from gap import OWN_DELAY, PUBLISHED, RESULTS, STYLE, WHOLE_EPISODE, simulator_runs
+from gap import STYLE
+from headline import OWN_DELAY, PUBLISHED, RESULTS, WHOLE_EPISODE, simulator_runs
 from lare_rl.compare.bootstrap import estimate, interquartile_mean
 from lare_rl.report.figures import COLOURS, add_white_background, to_svg
 

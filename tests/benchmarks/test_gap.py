@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 
 import gap
 
@@ -12,11 +11,3 @@ def test_references_have_the_shares_zero_and_one():
     low, high = np.array([-3.0, -1.0]), np.array([6.0, 10.0])
     assert gap.mean_share([gap.Sample(low, low, high)]) == 0
     assert gap.mean_share([gap.Sample(high, low, high)]) == 1
-
-
-@pytest.mark.parametrize("name", gap.COMPARISONS)
-def test_all_runs_exist(name):
-    comparison = gap.COMPARISONS[name]
-    methods = [*comparison.raw.values(), comparison.episodic, comparison.dense, comparison.paper, comparison.default]
-    directories = [directory for runs in methods for directory in runs]
-    assert [path for path in directories if not (gap.RESULTS / path / "metrics.jsonl").is_file()] == []
