@@ -67,6 +67,7 @@ EXPRESSIONS = {
         np.multiply(x, 2, out=np.zeros_like(x)) | np.divide(x, a[:, :1], out=np.zeros_like(x), where=b) | np.add(b, x < 1, dtype=int)
         (lambda v: [np.nan_to_num(v, copy=False, nan=7.0), v][1])(n * 1.0) | np.reciprocal(i + 2) | np.reciprocal(-1 - i)
         np.piecewise(i, [i < 2], [0.5, 1.7]) | b ** 2 + b ** 2 | np.square(b) + np.square(b)
+        np.isnan(b) | np.isinf(i) | np.isclose(i, i[:, ::-1])
     """,
     "reductions": """
         np.sum(x, axis=1) | x.sum(-1) | y.sum(axis=(1, 2)) | np.sum(y, axis=2, keepdims=True) | np.sum(x, axis=1, where=b)

@@ -105,6 +105,11 @@ STATEMENTS = [
     "x = x.copy()\nv = x.reshape(-1, 2, 3)[:, 0].ravel()\nv += 100\ny = x",
     "x = x.copy()\nv = x.reshape(-1, 2, 3)[:, 0]\nv += 100\ny = x",
     "y = x[:, 0:1].ravel()\ny *= 2",
+    "x = x.copy()\nfor k in np.arange(3):\n    v = x[:, k]\n    v *= 2\ny = x",
+    "x = x.copy()\nv = np.take(x, 0, axis=1)\nv += 1\nv = np.logaddexp.reduce(x[:, :1], axis=1)\nv += 1\ny = x",
+    "x = x.copy()\nv = np.maximum.accumulate(x[:, :1], axis=1)\nv += 1\nv = np.clip(x, None, None)\nv += 1\ny = x",
+    "x = x.copy()\nv = np.linalg.eigvalsh(x[:, :1, None])\nv += 1\nnp.atleast_1d(x, action)[0][:, 0] = 9\ny = x",
+    "v = [np.zeros_like(x)] * 2\nd = {0: v[0]}\nv[1] += x\nd[0] *= 2\ny = v[0]",
     # Numbers.
     "y = np.where(x > x.min(axis=1, keepdims=True), np.arange(6), np.iinfo(np.int64).max).min(1)",
     "y = np.polynomial.chebyshev.chebval(np.tanh(x[:, :1]), [0] * 30 + [1])",
@@ -115,11 +120,18 @@ STATEMENTS = [
     "y = np.median(np.where(x > -9, np.inf, x), axis=1)",
     "y = np.interp(x, [0, 90, 180], [1.0, 2.0, 3.0], period=-360)",
     "y = len(np.poly1d([0, 1, 2]).coeffs) + np.poly1d([0, 0]).coeffs[0]",
+    "y = np.interp(x, [0, 1, 1], [5, 7, 9], right=8) + np.interp(np.rint(x), [0, 1, 1], [5, 7, 9]) + np.interp(x, [1], [3])",
+    "b = x > 0\ny = np.rint(b) + np.rint(b) + np.round(b) + np.round(b) + np.reciprocal(b & ~b)",
+    "y = np.rint(np.arange(6)) * np.ones_like(x)\nz = np.rint(np.arange(6))\nz[0] = 0.5\ny = y + z",
+    "i = np.arange(6) + (x > 0)\nz = np.round(i, 1) + np.nanmax(i, axis=1, keepdims=True)\nz[:, 0] = 0.5\ny = z",
+    "y = np.insert(np.arange(6) + (x > 0), 0, 0.5, axis=1)",
     "y = np.modf(np.where(x > 1, np.inf, x))[0]",
     "y = np.vectorize(lambda v: v * 2, otypes=[int])(x)",
     # Types, and objects.
     "y = (type(3) is int) + 2 * ((x > 0).dtype == bool) + 4 * (np.arange(3).dtype == int) + 8 * (type(3) is float)",
     "y = isinstance(np.array([1.0, 2.0]).max(), float) + 2 * (np.arange(3).dtype == 'int64') + 4 * (np.float32 == float)",
+    "c = np.array([1, 2])\ny = sum(2**k * isinstance(v, t) for k, (v, t) in enumerate([(c[0], np.integer), (c[0], int), (c[0], np.ndarray),"
+    " (c.mean(), np.floating), (c[0] > 0, np.bool_), (c, np.ndarray)])) + 64 * np.isscalar(c[0])",
     "from collections import namedtuple\nP = namedtuple('P', 'a b')\np = P(1, 2)\n"
     "y = (p == P(1, 2)) + 2 * (p == (1, 2)) + 4 * isinstance(p, tuple) + 8 * (P(1, 3) > p) + 16 * len(p) + 64 * (2 in p) + 128 * bool(p)",
     "from dataclasses import dataclass\n@dataclass\nclass P:\n    a: float\n    b: float\n"
@@ -130,6 +142,12 @@ STATEMENTS = [
     "y = (a == A(0)) + 2 * (a != b) + 4 * (a < b) + 8 * (a > b) + 16 * (not a) + 32 * len(b) + 128 * (1 in b)",
     "class A:\n    pass\na, b = A(), A()\ny = (a == a) + 2 * (a == b) + 4 * (a is a) + 8 * (a != 3) + 16 * bool(a)",
     "class A:\n    v = 0\na, b = A(), A()\nit = iter([a, b])\nnext(it).v += 1\ny = a.v + 2 * b.v",
+    "class A:\n    k = 1\n    def f(self):\n        return self.k + self.g()\n    def g(self):\n        return 10\n"
+    "class B(A):\n    k = 2\n    def f(self):\n        return 100 + super().f()\n    def g(self):\n        return 20\ny = B().f()",
+    # Numbers of NumPy: keys, and how often a list is repeated.
+    "d, k = {0: 5, 1: 7}, np.argmax([1, 2])\ny = d.get(k, 0) + 10 * (k in d) + 20 * (k in {0, 1}) + d.pop(k, 50)\n"
+    "y += d.setdefault(k, 3) + d[1]",
+    "n = np.max([2, 3])\ny = len([0.0] * n) + 10 * len(n * (0,))",
     # Iterators.
     "it = iter([1, 2, 3, 4])\nfor v in it:\n    if v == 2:\n        break\ny = sum(it)",
     "it = iter([1, 2])\ny = {next(it): next(it)}[1]",

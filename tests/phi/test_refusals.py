@@ -139,7 +139,7 @@ ACCEPTED = set(
     "builtin_as_value inner_function_returned dunder_parameter dunder_loop_target comprehension_rebinds_np loop_rebinds_range "
     "with_two_contexts errstate_raise dtype_by_variable dtype_by_condition starred_subscript string_default_of_get "
     "einsum_pattern_by_key annotation_walrus annotation_lambda module_constant_appended import_swapped finfo_machar decorated "
-    "list_times_numpy_integer round_to_minus_1e9_digits "
+    "round_to_minus_1e9_digits "
     # Their factors are not finite.
     "np_empty nan_division nan_log_negative inf_exp dtype_complex float_nan_string".split()
 )

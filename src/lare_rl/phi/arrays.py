@@ -93,6 +93,16 @@ class Array(_ArrayLike):
         node = current_builder().nodes[self.node]
         return node.option if node.op == "constant" else None
 
+    @property
+    def is_number(self) -> bool:
+        """Whether it is a number of NumPy: a constant without axes."""
+        return not self.ndim and self.constant is not None
+
+    @property
+    def is_integer(self) -> bool:
+        """Whether it is an integer of NumPy, which Python takes where it takes an int."""
+        return self.is_number and self.kind == "int"
+
     def number(self) -> Any:
         """Return the number of Python that is the only entry of a constant."""
         values = self.constant
@@ -303,8 +313,8 @@ def elementwise(op: str, *operands: Any) -> Any:
 def power(x: Any, exponent: Any) -> Any:
     """Return x ** exponent. Small whole powers are products, and half a power is a square root."""
     value = exponent if isinstance(exponent, (int, float, Operand)) else as_array(exponent)
-    if isinstance(value, Array) and value.constant is not None and not value.ndim:
-        value = value.constant.item()
+    if isinstance(value, Array) and value.is_number:
+        value = value.number()
     if not isinstance(value, (int, float)) or value not in (0.5, 1, 2, 3, 4):
         return elementwise("power", x, exponent)
     if value == 0.5:

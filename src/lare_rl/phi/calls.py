@@ -222,12 +222,12 @@ def class_attribute(runtime: Runtime, owner: Class | Instance, name: str) -> Any
         return owner.attributes[name]
     if not owner.cls.has(name) and owner.cls.has("__getattr__"):
         return runtime.call(class_attribute(runtime, owner, "__getattr__"), [name], {})
-    value = owner.cls.find(name)
+    value, target = owner.cls.find(name), owner if owner.bound_to is None else owner.bound_to
     if isinstance(value, Function):
-        return Bound(lambda *args, **kwargs: runtime.call(value, [owner, *args], kwargs))
+        return Bound(lambda *args, **kwargs: runtime.call(value, [target, *args], kwargs))
     if isinstance(value, Decorated) and value.kind == "property":
-        return runtime.call(value.function, [owner], {})
-    return _unwrap(runtime, owner.cls, value)
+        return runtime.call(value.function, [target], {})
+    return _unwrap(runtime, target if isinstance(target, Class) else target.cls, value)
 
 
 def _unwrap(runtime: Runtime, cls: Class, value: Any) -> Any:
@@ -238,9 +238,7 @@ def _unwrap(runtime: Runtime, cls: Class, value: Any) -> Any:
 
 def super_object(scope: Scope) -> Instance:
     """Return `super()`: the object of a method, with the attributes of the bases of the method's class."""
-    owner = scope.function.owner
-    if owner is None or not owner.bases:
+    owner, instance = scope.function.owner, scope.function.instance
+    if owner is None or not owner.bases or not isinstance(instance, (Instance, Class)):
         raise TypeError("super() is for methods of a class with a base")
-    instance = scope.function.instance
-    base = Class(owner.bases[0].name, owner.bases[0].attributes, owner.bases[0].bases)
-    return Instance(base, instance.attributes)
+    return Instance(Class(owner.name, {}, owner.bases), bound_to=instance)

@@ -11,7 +11,7 @@ from lare_rl.phi.arrays import Array, as_array
 from lare_rl.phi.numpy_functions import call_numpy
 from lare_rl.phi.numpy_functions.registry import dtype_name
 from lare_rl.phi.operand import Operand
-from lare_rl.phi.runtime import Runtime
+from lare_rl.phi.runtime import Runtime, check_key
 from lare_rl.phi.values import Instance, Symbol, describe
 
 __all__ = ["compare"]
@@ -32,7 +32,9 @@ def compare(runtime: Runtime, op: ast.cmpop, x: Any, y: Any) -> Any:
             return _contains(runtime, y, x) == isinstance(op, ast.In)
         if isinstance(y, Array):
             return runtime.truth(call_numpy("any", [y == x], {})) == isinstance(op, ast.In)
-        if isinstance(x, Operand) and isinstance(y, (list, tuple)):
+        if isinstance(y, dict):
+            x = check_key(x)
+        elif isinstance(x, Operand) and isinstance(y, (list, tuple)):
             return any(runtime.truth(x == item) for item in y) == isinstance(op, ast.In)
     elif isinstance(x, Symbol) and isinstance(y, (Symbol, str)):
         return _is_same_type(x, y, strict=isinstance(op, (ast.Is, ast.IsNot))) == isinstance(op, (ast.Is, ast.Eq))

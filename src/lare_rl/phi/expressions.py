@@ -47,6 +47,9 @@ def apply_binary(runtime: Runtime, op: ast.operator, x: Any, y: Any) -> Any:
             return runtime.call(runtime.attribute(owner, method), [other], {})
     if isinstance(x, Operand) or isinstance(y, Operand):
         runtime.meter.pay_for_all_within([x, y])
+        sequence, times = (x, y) if isinstance(y, Operand) else (y, x)
+        if name == "mul" and isinstance(sequence, (list, tuple)) and isinstance(times, Array) and times.is_integer:
+            return combine_values(runtime.meter, name, sequence, times.number())
         return function(*(value if isinstance(value, (Operand, int, complex)) else as_array(value) for value in (x, y)))
     if isinstance(x, BatchSize) or isinstance(y, BatchSize):
         if not isinstance(x, (int, float, BatchSize)) or not isinstance(y, (int, float, BatchSize)):

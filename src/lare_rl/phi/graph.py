@@ -188,12 +188,12 @@ KIND_OF_CODE: dict[str, NumberKind] = {"b": "bool", "i": "int", "u": "int", "f":
 
 ELEMENTWISE: dict[str, str] = {
     **dict.fromkeys(
-        "sqrt exp log log1p expm1 exp2 log2 log10 cbrt sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh arccosh arctanh "
+        "rint sqrt exp log log1p expm1 exp2 log2 log10 cbrt sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh arccosh arctanh "
         "arctan2 hypot logaddexp logaddexp2 divide".split(),
         "float",
     ),
     **dict.fromkeys(
-        "abs negative sign floor ceil trunc rint maximum minimum fmax fmin add subtract multiply power remainder fmod "
+        "abs negative sign floor ceil trunc maximum minimum fmax fmin add subtract multiply power remainder fmod "
         "floor_divide copysign".split(),
         "same",
     ),
@@ -236,9 +236,9 @@ def elementwise_kinds(
             op, result = _ON_BOOL[op], "logical"
         else:
             kind = "int"
-    if op in ("floor", "ceil", "trunc", "rint") and kind == "int":
+    if op in ("floor", "ceil", "trunc") and kind == "int":
         return None, kind, kind
-    if op == "copysign" or (op == "power" and kind == "int" and negative_exponent):
+    if op in ("copysign", "isnan", "isinf", "isfinite") or (op == "power" and kind == "int" and negative_exponent):
         kind = "float"
     operands: NumberKind = "float" if result == "float" else "bool" if result == "logical" else kind
     return op, operands, "bool" if result in ("bool", "logical") else operands

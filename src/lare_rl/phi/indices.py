@@ -48,7 +48,9 @@ def index_entries(layout: Layout, items: Sequence[Any]) -> list[Any]:
                 raise IndexError(f"a mask of the shape {item.shape} does not fit an array of the shape {layout.shape}")
             entries.extend(item.constant.nonzero())
         elif hasattr(item, "is_row_number"):
-            entries.append(item if item.constant is None else _check_integers(item).constant)
+            values = None if item.constant is None else _check_integers(item).constant
+            # With an integer of NumPy, as with an int, the result is a view.
+            entries.append(item if values is None else values if values.ndim else int(values))
         elif isinstance(item, (bool, float)):
             raise IndexError(f"{item} is not an index: an index is an integer, a slice or an array of integers")
         else:

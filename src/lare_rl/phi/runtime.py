@@ -79,7 +79,7 @@ def check_text(text: str) -> str:
 
 def check_key(value: Any) -> Any:
     """Return a value that can be the key of a dictionary. Raises `TypeError` for others."""
-    if isinstance(value, Array) and not value.ndim and value.constant is not None:
+    if isinstance(value, Array) and value.is_number:
         value = value.number()
     items = value if isinstance(value, tuple) else (value,)
     if len(items) > MAX_KEY_LENGTH or not all(

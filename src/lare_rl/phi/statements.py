@@ -202,13 +202,14 @@ def _augment(runtime: Runtime, statement: ast.AugAssign, scope: Scope) -> None:
     elif isinstance(old, dict) and type(old) is type(new):
         old.clear()
         old.update(new)
-    elif isinstance(target, ast.Subscript):
-        if isinstance(container, Array):
-            _check_in_place(container, new)
-        _set_item(runtime, container, index, new)
+    elif isinstance(target, ast.Subscript) and isinstance(container, Array):
+        _check_in_place(container, new)
+        container[index] = new
     elif isinstance(old, Array) and old.ndim:
         _check_in_place(old, new)
         old[...] = new
+    elif isinstance(target, ast.Subscript):
+        _set_item(runtime, container, index, new)
     elif isinstance(target, ast.Attribute):
         _set_attribute(container, target.attr, new)
     else:

@@ -158,7 +158,7 @@ def _dict_method(
     runtime: Runtime, values: dict[Any, Any], name: str, args: Sequence[Any], kwargs: dict[str, Any]
 ) -> Any:
     if name in ("get", "pop", "setdefault"):
-        check_key(args[0])
+        args = [check_key(args[0]), *args[1:]]
     if name == "update":
         values |= runtime.call(Symbol("dict"), args, kwargs)
         runtime.meter.pay_for_list(len(values))

@@ -87,6 +87,8 @@ class Instance(_Value):
 
     cls: Class
     attributes: dict[str, Any] = field(default_factory=dict)
+    bound_to: Any = None
+    """For `super()`: the object, or the class, that its methods are called on."""
 
 
 class Set(dict):

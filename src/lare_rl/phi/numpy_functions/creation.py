@@ -160,14 +160,12 @@ def indices(dimensions: list[int], dtype: Any = "int") -> Array:
     return astype(np.indices(dimensions), dtype)
 
 
-def _as_indices(a: Array) -> Array:
-    return FUNCTIONS["flatnonzero"](a) if a.kind == "bool" else a
-
-
 array_functions(
     {
         "copy": lambda a: a.copy(),
-        "ix_": lambda *args: rearrange(lambda arrays: np.ix_(*arrays), list(map(_as_indices, args))),
+        "ix_": lambda *args: rearrange(
+            lambda arrays: np.ix_(*arrays), [FUNCTIONS["flatnonzero"](a) if a.kind == "bool" else a for a in args]
+        ),
     }
 )
 numpy_functions(

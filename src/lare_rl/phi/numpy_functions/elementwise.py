@@ -46,7 +46,7 @@ for _names, _function in {
     "float_power": lambda x, y: power(x * 1.0, y),
     "square": lambda x: power(x, 2),
     # An integer, such as 1 / 3, is cut to 0.
-    "reciprocal": lambda x: elementwise("where", abs(x) == 1, x, 0) if x.kind == "int" else 1.0 / x,
+    "reciprocal": lambda x: 1.0 / x if x.kind == "float" else elementwise("where", abs(x) == 1, x, 0),
     "positive conj conjugate": lambda x: +x,
     "real": lambda x: x,
     "degrees rad2deg": lambda x: x * (180 / math.pi),
@@ -85,7 +85,7 @@ def where(condition: Operand, x: Operand | None = None, y: Operand | None = None
 def clip(a: Operand, a_min: Any = None, a_max: Any = None, *, min: Any = None, max: Any = None) -> Any:  # noqa: A002
     for op, bound in (("maximum", min if a_min is None else a_min), ("minimum", max if a_max is None else a_max)):
         a = a if bound is None else elementwise(op, a, as_operand(bound))
-    return a
+    return +a
 
 
 @numpy_function()
@@ -103,6 +103,8 @@ def nan_to_num(x: Operand, copy: Any = True, nan: Any = 0.0, posinf: Any = None,
 
 @numpy_function("round", "around", "round_")
 def round_(a: Operand, decimals: int = 0) -> Any:
+    if getattr(a, "kind", "float") == "int" and decimals >= 0:
+        return +a
     if decimals == 0:
         return elementwise("rint", a)
     scale = 10.0 ** max(-30, min(decimals, 30))

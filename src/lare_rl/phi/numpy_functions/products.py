@@ -251,7 +251,7 @@ def eigvalsh(a: Array, UPLO: Any = "L") -> Any:  # noqa: N803
     if n > 3:
         raise RefusedError("E-NUMPY", "np.linalg.eigvalsh of matrices larger than 3 x 3 is not available")
     if n == 1:
-        return a[..., 0]
+        return +a[..., 0]
     if n == 3:
         return _eigenvalues_3x3(a, UPLO)
     off = a[..., 1, 0] if UPLO == "L" else a[..., 0, 1]

@@ -107,6 +107,8 @@ SUBSTITUTES = {"sum": 0, "prod": 1, "max": -math.inf, "min": math.inf, "argmax":
 
 @numpy_variants({f"nan{op}": op for op in SUBSTITUTES})
 def reduce_without_nan(op: str, a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
+    if a.kind != "float":
+        return along(op, a, axis, keepdims)
     is_nan = elementwise("isnan", a)
     result = along(op, elementwise("where", is_nan, SUBSTITUTES[op], a), axis, keepdims)
     if op in ("max", "min"):  # NaN if nothing else is there
@@ -149,7 +151,7 @@ def reduce_by(
     for at in reversed(array.row_axes(axis)):
         slices = [array.select(at, slice(i, i + 1) if keepdims else i) for i in range(array.row_shape[at])]
         array = functools.reduce(lambda x, y: elementwise(ufunc, x, y), slices)
-    return array
+    return +array
 
 
 @numpy_variants({f"{ufunc}.outer": ufunc for ufunc in BINARY})

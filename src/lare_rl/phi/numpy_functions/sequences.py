@@ -51,7 +51,7 @@ def accumulate(ufunc: str, array: Array, axis: Any = 0) -> Any:
         before = [max(i - shift, 0) for i in range(size)]
         array = elementwise(ufunc, array, array.select(at, before))
         shift *= 2
-    return array
+    return +array
 
 
 @numpy_function()

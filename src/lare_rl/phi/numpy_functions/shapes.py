@@ -9,7 +9,7 @@ import functools
 import inspect
 import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ from lare_rl.phi.numpy_functions.registry import (
     numpy_variants,
     require_constant,
 )
+from lare_rl.phi.rearrange import map_leaves
 
 
 def _register(names: str, convert: Callable[[Any], Any]) -> None:
@@ -56,9 +57,9 @@ for _names in ("stack", "hstack", "vstack row_stack", "dstack", "column_stack"):
     _register(_names, as_arrays)
 
 
-def _to_arrays(values: Any) -> Any:
-    """Return nested lists with arrays in them."""
-    return list(map(_to_arrays, values)) if isinstance(values, list) else as_array(values)
+def _rearrange_each(function: Callable[[Any], Any], arrays: Sequence[Array]) -> Any:
+    results = tuple(rearrange(function, x) for x in arrays)
+    return results[0] if len(results) == 1 else results
 
 
 numpy_functions(
@@ -67,15 +68,15 @@ numpy_functions(
         "append": lambda arr, values, axis=None: rearrange(
             lambda both: np.append(both[0], both[1], axis), [as_array(arr), as_array(values)]
         ),
-        "block": lambda arrays: rearrange(np.block, _to_arrays(arrays)),
+        "block": lambda arrays: rearrange(np.block, map_leaves(as_array, arrays)),
         "broadcast_shapes": lambda *args: broadcast_arrays(*map(FUNCTIONS["zeros"], args))[0].shape,
     }
 )
 array_functions(
     {
-        "atleast_1d": lambda *arys: rearrange(lambda arrays: np.atleast_1d(*arrays), list(arys)),
-        "atleast_2d": lambda *arys: rearrange(lambda arrays: np.atleast_2d(*arrays), list(arys)),
-        "atleast_3d": lambda *arys: rearrange(lambda arrays: np.atleast_3d(*arrays), list(arys)),
+        "atleast_1d": lambda *arys: _rearrange_each(np.atleast_1d, arys),
+        "atleast_2d": lambda *arys: _rearrange_each(np.atleast_2d, arys),
+        "atleast_3d": lambda *arys: _rearrange_each(np.atleast_3d, arys),
         "shape": lambda a: a.shape,
         "ndim": lambda a: a.ndim,
         "tril": lambda m, k=0: _with_zeros(np.tril, m, (-1, -2), k),
@@ -199,7 +200,7 @@ def insert(arr: Array, obj: int, values: Array, axis: Any = None) -> Any:
     arr, at = _flatten_without_axis(arr, axis)
     length = arr.row_shape[at]
     current_builder().check_size([math.prod(arr.row_shape) // length, length + math.prod(values.row_shape)])
-    return rearrange(lambda both: np.insert(both[0], obj, both[1], at), [arr, values])
+    return rearrange(lambda both: np.insert(both[0], obj, both[1], at), [arr, astype(values, arr.kind)])
 
 
 @numpy_function("sliding_window_view", "lib.stride_tricks.sliding_window_view")
@@ -226,7 +227,7 @@ def take(a: Array, indices: Any, axis: Any = None, mode: Any = "raise") -> Any:
     if mode in ("clip", "wrap"):
         size = a.row_shape[at]
         index = FUNCTIONS["clip"](as_array(index), 0, size - 1) if mode == "clip" else as_array(index) % size
-    return a.select(at, index)
+    return +a.select(at, index)
 
 
 def _along_axis(arr: Array, indices: Array, axis: Any) -> tuple[Any, ...]:

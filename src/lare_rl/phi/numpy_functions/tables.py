@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import Array, as_array, elementwise
+from lare_rl.phi.arrays import Array, as_array, concatenate, elementwise
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.limits import MAX_CONSTANT_SIZE, MAX_SYSTEM_SIZE, RefusedError
 from lare_rl.phi.numpy_functions.reductions import along
@@ -122,24 +122,18 @@ def interp(x: Array, xp: Array, fp: Array, left: Any = None, right: Any = None, 
         fp = fp[as_array([len(order) - 1, *range(len(order)), 0])]
     if len(knots) != fp.row_shape[0] or not (np.diff(knots) >= 0).all():
         raise ValueError("np.interp needs rising xp, and as many fp")
-    start = _interval(x, knots)
+    first, last = float(knots[0]), float(knots[-1])
+    if last in knots[:-1] or len(knots) == 1:  # a jump at the end, or a single point
+        knots, fp = np.append(knots, last + 1), concatenate([fp, fp[-1:]], 0)
+    current_builder().check_size((math.prod(x.row_shape), len(knots)))
+    start = _insertion_index(x, as_array(knots[1:-1]), "right") if len(knots) > 2 else elementwise("isnan", x) * 0
     low, high = fp[start], fp[start + 1]
     left_edge, width = as_array(knots[:-1])[start], as_array(np.diff(knots))[start]
     share = (x - left_edge) / elementwise("where", width == 0, 1.0, width)
     result = low + (high - low) * FUNCTIONS["clip"](share, 0.0, 1.0)
     result = elementwise("where", elementwise("isnan", x), math.nan, result)
-    result = result if left is None else elementwise("where", x < float(knots[0]), left, result)
-    return result if right is None else elementwise("where", x > float(knots[-1]), right, result)
-
-
-def _interval(x: Array, knots: np.ndarray) -> Any:
-    """Return the index of the interval between knots that each number lies in."""
-    if len(knots) < 2:
-        raise ValueError("np.interp needs at least two points")
-    current_builder().check_size((math.prod(x.row_shape), len(knots)))
-    if len(knots) == 2:
-        return elementwise("isnan", x) * 0
-    return _insertion_index(x, as_array(knots[1:-1]), "right")
+    result = result if left is None else elementwise("where", x < first, left, result)
+    return result if right is None else elementwise("where", x > last, right, result)
 
 
 @numpy_function()

@@ -26,6 +26,11 @@ _PARENTS = {
     "tuple": _SEQUENCE, "dict": ["collections.abc.Mapping", "typing.Mapping"], "function": ["collections.abc.Callable"],
 }  # fmt: skip
 """The types above a type."""
+_NUMPY_SCALARS = {
+    "float": ["float", "np.float64", "np.floating", "np.number", *_REAL],
+    "int": ["np.int64", "np.integer", "np.number", *_PARENTS["int"]], "bool": ["np.bool_", "np.bool"],
+}  # fmt: skip
+"""The types of NumPy's numbers: float64 is a float of Python, too."""
 
 
 @builtin("isinstance")
@@ -36,8 +41,8 @@ def isinstance_(_: Runtime, value: Any, classes: Any) -> bool:
         return any(cls in classes for cls in types)
     name = value_type(value).name
     names = [name, "object", *_PARENTS.get(name, ())]
-    if isinstance(value, Array) and not value.ndim and value.constant is not None and value.kind == "float":
-        names += ["float", "np.floating", "np.float64", *_PARENTS["float"]]  # a number of NumPy
+    if isinstance(value, Array) and value.is_number:
+        names = [*_NUMPY_SCALARS[value.kind], "np.generic", "object"]
     return any(isinstance(cls, Symbol) and cls.name in names for cls in classes)
 
 
@@ -118,7 +123,7 @@ BUILTINS |= {
         default if default_factory is None else Decorated("default_factory", default_factory)
     ),
     "np.dtype": lambda _, dtype: Symbol(f"np.{dtype_name(dtype)}") if dtype_kind(dtype) else None,
-    "np.isscalar": lambda _, value: isinstance(value, (bool, int, float, str)),
+    "np.isscalar": lambda _, value: isinstance(value, (bool, int, float, str)) or getattr(value, "is_number", False),
     **{f"np.{name}": _conversion(name) for name in KIND_OF_DTYPE if name.isidentifier() and len(name) > 2},
     **{
         name: lambda runtime, *message: " ".join(format_value(runtime.meter, x, "") for x in message)[:200]
