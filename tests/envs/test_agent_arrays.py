@@ -67,7 +67,7 @@ def test_spaces_that_do_not_fit_together(spaces, content):
 
 # Teams
 
-NAMES = ["cat_0", "mouse_0", "cat_1"]
+NAMES, GROUPED = ["cat_0", "mouse_0", "cat_1"], ["cat_0", "cat_1", "mouse_0"]
 
 
 def test_agent_kind():
@@ -85,11 +85,9 @@ def make_roles(**patterns):
     [
         ({}, NAMES, (Team("agent", 0, 3),)),
         ({"team": "all"}, NAMES, (Team("all", 0, 3),)),
-        (
-            {"team": "mouse", "agents": ("mouse_0",)},
-            ["mouse_0", "cat_0", "cat_1"],
-            (Team("mouse", 0, 1), Team("not mouse", 1, 3)),
-        ),
+        # A single team has the places that it has among the teams of a draft.
+        ({"team": "mouse", "agents": ("mouse_0",)}, GROUPED, (Team("before mouse", 0, 2), Team("mouse", 2, 3))),
+        ({"team": "cat", "agents": ("cat_*",)}, GROUPED, (Team("cat", 0, 2), Team("after cat", 2, 3))),
         (
             {"environment": "a/b", "teams": make_roles(mouse=("mouse_*",), cat=("cat_*",))},
             ["mouse_0", "cat_0", "cat_1"],

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 
 from helpers.toy_envs import Chase, toy_spec
-from lare_rl.envs.env_errors import MAX_ERROR, EnvOutputError, check_finite
+from lare_rl.envs.env_errors import MAX_ERROR, EnvOutputError, check_finite, one_line_errors
 from lare_rl.envs.gymnasium_env import GymnasiumEnv, make_gymnasium
 from lare_rl.envs.interface import Team
 from lare_rl.errors import LareError
@@ -187,9 +187,10 @@ def test_invalid_value_or_failure(kwargs, content):
     texts = {"observation": "0: the target\n1: noise"}
     task = toy_spec(environment="foreign/Invalid-v0", measures=measures, group=group, **texts)
     env = GymnasiumEnv(task, **kwargs)
-    with pytest.raises(LareError, match=content) as error:
+    with pytest.raises(LareError, match=content) as error, one_line_errors("a caller"):
         use(env)
     assert "\n" not in str(error.value)
+    assert kwargs.get("error") in (None, error.value, error.value.__cause__)  # `lare-rl --debug` prints the cause
     assert isinstance(error.value, EnvOutputError) == content.startswith(("observation", "reward"))
 
 

@@ -92,8 +92,8 @@ def test_invalid_task(spec_file, changes, content):
         (b"\xff", "cannot be read"),
         (b"", "'name', 'environment', .* are missing"),
         # TOML has values that JSON lacks. A run would store them as null or text, which make another environment.
-        (b'like = "CN-6"\narguments = { n = 2001-02-03 }', r"arguments\.n = .* JSON"),
-        (b'like = "CN-6"\narguments = { n = [1, nan] }', r"arguments\.n.* = nan: .* finite"),
+        (b'like = "CN-6"\narguments = { n = 2001-02-03 }', r"arguments .*2001.* JSON"),
+        (b'like = "CN-6"\narguments = { n = [1, nan] }', r"arguments .*nan.* JSON.* finite"),
     ],
 )
 def test_file_without_a_task(tmp_path, text, content):
@@ -105,7 +105,7 @@ def test_file_without_a_task(tmp_path, text, content):
 
 def test_arguments_are_as_a_run_stores_them():
     assert toy_spec(arguments={"a": ({"size": (3, 4)}, 1.0)}).arguments == {"a": [{"size": [3, 4]}, 1.0]}
-    with pytest.raises(LareError, match=r"arguments\.rewards.*key.* = 0: .*string"):
+    with pytest.raises(LareError, match=r"arguments .*0: 1\.0.* JSON.* keys"):
         toy_spec(arguments={"rewards": [{0: 1.0}]})
 
 

@@ -294,7 +294,7 @@ def test_environment_that_cannot_be_made(environment, content):
     [
         ({"max_cycles": None}, "no time limit"),
         ({"actions": dict.fromkeys(("a_0", "a_1"), MultiDiscrete([2, 2]))}, f"{TOY}.*action space of a_0"),
-        ({"possible_agents": ["a_0", "b_0"]}, "spaces cannot be read: 'b_0'"),
+        ({"possible_agents": ["a_0", "b_0"]}, "spaces cannot be read: KeyError 'b_0'"),
         ({"spoil_reset": lambda toy, *results: vars(toy).pop("agents") and results}, "its agents cannot be read"),
     ],
 )

@@ -179,9 +179,11 @@ def test_policy_receives_the_observation_before_the_step():
     (episode,) = play_episodes(toy_spec(max_episode_steps=3), 1, act)
     assert observations == episode.observation[:, 0].tolist()
     assert episode.env_action.tolist() == [[[0.25]]] * 3
+    with pytest.raises(LareError, match=r"policy returned array\(0.5\), not .*shape \(1,\)"):
+        play_episodes(toy_spec(), 1, lambda observation: 0.5)
     HUNTS.clear()
-    with pytest.raises(LareError, match=r"policy returned array\(0.5\), not .*shape \(2,\)"):
-        play_episodes(make_role("cat"), 1, lambda observation: 0.5)
+    with pytest.raises(LareError, match="single agent, and the environment has 3"):
+        play_episodes(make_role("cat"), 1, lambda observation: np.float32([1, 0]))
     assert [env.closed for env in HUNTS] == [True]
 
 

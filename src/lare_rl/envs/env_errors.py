@@ -53,12 +53,14 @@ def as_lare_error(message: str, error: BaseException, hint: str = "") -> LareErr
 
 @contextlib.contextmanager
 def one_line_errors(message: str, make_hint: Callable[[BaseException], str] = lambda _: "") -> Iterator[None]:
-    """Turn every error of a block into a `LareError` that begins with `message`.
+    """Turn every error of a block into a `LareError` that begins with `message`, unless it is a `LareError` already.
 
     This includes `SystemExit`, which some programs raise when a window is closed: the run must not look complete then.
     """
     try:
         yield
+    except LareError:  # unchanged, with its cause
+        raise
     except (Exception, SystemExit) as error:
         raise as_lare_error(message, error, make_hint(error)) from error
 
@@ -135,7 +137,7 @@ def read_measures(
     """Return the measures and the group of the task from each agent's `info`: the means over the agents that report them.
 
     Before the last step, measures are 0, and so is a group that no agent reports. Raises `LareError` if a value of the last step is
-    missing or not a number, or if the group is not valid.
+    missing or not a number, or if the group of any step is not valid.
     """
     measures = {}
     for name in task.info_keys:
@@ -151,7 +153,7 @@ def _read_measure(infos: Sequence[Mapping[Any, Any]], name: str) -> float:
     try:
         values = [to_float(info[name]) for info in infos if name in info]
     except ValueError as error:
-        raise LareError(f"the measure {name!r} in the last step's info {error}") from None
+        raise LareError(f"the measure or group {name!r} in info {error}") from None
     if not values:
         keys = ", ".join(sorted({str(key) for info in infos for key in info}))
         content = f"has only {keys}" if keys else "is empty (was the episode cut at max_episode_steps?)"

@@ -86,7 +86,7 @@ register_family("particles", "lare_rl.envs.particles.particle_env:make")
 register_family("smax", "lare_rl.envs.smax.smax_env:make", score="sum")
 register_family("smac", "lare_rl.envs.starcraft:make", score="sum")
 register_family("pettingzoo", "lare_rl.envs.pettingzoo_env:make", reads=OPTIONAL_KEYS)
-_SINGLE_AGENT: dict[str, Any] = {"reads": OPTIONAL_KEYS[:2], "single_agent": True}
+_SINGLE_AGENT: dict[str, Any] = {"reads": ("max_episode_steps", "arguments"), "single_agent": True}
 register_family("gymnax", "lare_rl.envs.gymnax_env:make", **_SINGLE_AGENT)
 register_family("brax", "lare_rl.envs.robot_env:make_brax", **_SINGLE_AGENT)
 register_family("playground", "lare_rl.envs.robot_env:make_playground", **_SINGLE_AGENT)
@@ -95,7 +95,7 @@ register_family("jaxmarl", "lare_rl.envs.jaxmarl_env:make", reads=OPTIONAL_KEYS)
 
 
 def find_score_type(task: TaskSpec) -> str | None:
-    """Return "sum" or "average" (over the steps of an episode) if the task or its family says so."""
+    """Return the form of a return, such as "sum" or "average" over its steps, that the task or else its family names, or None."""
     return task.score or find_family(task).score
 
 

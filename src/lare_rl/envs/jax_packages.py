@@ -38,7 +38,7 @@ __all__ = [
     "mask_combinations",
     "raw_key",
     "read_measures",
-    "unusable",
+    "unusable_error",
 ]
 
 MAX_COMBINATIONS = 1024
@@ -89,7 +89,7 @@ def construct(
         return make(name, **(task.arguments if arguments is None else arguments))
 
 
-def unusable(environment: str, reason: str) -> LareError:
+def unusable_error(environment: str, reason: str) -> LareError:
     return LareError(f"environment {environment!r} cannot be used: {reason}")
 
 
@@ -141,19 +141,19 @@ def action_fields(space: Any, environment: str) -> dict[str, Any]:
         shape, sizes = np.shape(n_values), tuple(map(int, np.ravel(n_values)))
         if (size := math.prod(sizes)) > MAX_COMBINATIONS:
             combinations = f"{size} combinations, more than {MAX_COMBINATIONS}"
-            raise unusable(environment, f"its {len(sizes)} choices at a time have {combinations}")
+            raise unusable_error(environment, f"its {len(sizes)} choices at a time have {combinations}")
         return {"discrete": True, "action_size": size, "choice_sizes": sizes if shape else (), "package_shape": shape}
     for low, high in (("low", "high"), ("minimum", "maximum")):
         if hasattr(space, low) and np.issubdtype(space.dtype, np.floating):
             return bounded_action(getattr(space, low), getattr(space, high), space.shape, environment)
-    raise unusable(environment, f"its actions are {short_repr(space)}: {TRAINABLE_ACTIONS}")
+    raise unusable_error(environment, f"its actions are {short_repr(space)}: {TRAINABLE_ACTIONS}")
 
 
 def bounded_action(low: Any, high: Any, shape: Sequence[int], environment: str) -> dict[str, Any]:
     """Return the fields of `EnvSpec` about a continuous action of a single agent. Raises `LareError` if it has no bounds."""
     low, high = (np.broadcast_to(np.asarray(bound, np.float32), shape).reshape(1, -1).copy() for bound in (low, high))
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        raise unusable(environment, "its actions have no bounds")
+        raise unusable_error(environment, "its actions have no bounds")
     return {"discrete": False, "action_size": low.size, "low": low, "high": high, "package_shape": tuple(shape)}
 
 

@@ -39,7 +39,7 @@ def make(task: TaskSpec, **_: Any) -> "JaxMARLEnv":
     jaxmarl = jax_packages.import_package("jaxmarl", task)
     names = jaxmarl.registered_envs
     if task.name_in_family in SELF_RESETTING:
-        raise jax_packages.unusable(task.environment, "its steps hide the last observation of a game")
+        raise jax_packages.unusable_error(task.environment, "its steps hide the last observation of a game")
     env = jax_packages.construct(task, names, jaxmarl.make)
     limit_name = next((name for name in TIME_LIMITS if getattr(env, name, None)), None)
     changes: dict[str, Any] = {}
@@ -77,13 +77,13 @@ class JaxMARLEnv:
         with one_line_errors(f"environment {self._name!r} cannot be used"):
             observations, state = jax.eval_shape(env.reset, jnp.zeros(2, jnp.uint32))
             if not (isinstance(observations, Mapping) and set(names) <= set(observations)):
-                raise jax_packages.unusable(self._name, "its observations are not a dictionary by agent")
+                raise jax_packages.unusable_error(self._name, "its observations are not a dictionary by agent")
             agents = [_make_agent(x, env.action_space(x), jax_packages.flat_size(observations[x])) for x in names]
             self.layout = AgentArrays(agents)
             self._masks = _find_masks(env, state) if self.layout.discrete else None
             actions = {agent.name: jnp.asarray(agent.action_space.sample()) for agent in agents}
             infos = jax.eval_shape(env.step_env, jnp.zeros(2, jnp.uint32), state, actions)[-1]
-        self._from_observations = any(role.credit_scope == "state" for role in (task, *task.teams))
+        self._credit_from_state = task.credit_scope == "state"
         self.spec = self.layout.make_spec(
             teams,
             max_steps=max_steps,
@@ -109,9 +109,8 @@ class JaxMARLEnv:
         )
         reward = jnp.stack([jnp.asarray(rewards[agent.name], jnp.float32).reshape(()) for agent in agents])
         done = jnp.stack([jnp.asarray(dones[agent.name], bool).reshape(()) for agent in agents])
-        ended = jnp.asarray(dones[ALL], bool).reshape(())
+        ended = jnp.asarray(dones[ALL], bool).reshape(()) | ~(state.alive & ~done).any()
         alive = state.alive & (ended | ~done)
-        ended |= ~alive.any()
         next_state = JaxMARLState(jax_packages.cast_like(env_state, state.env), state.steps + 1, alive)
         return next_state, self._make_timestep(observations, next_state, reward * state.alive, ended, infos)
 
@@ -148,7 +147,7 @@ class JaxMARLEnv:
             return jax_packages.flatten_tree(observations[WORLD_STATE])
         if hasattr(self.env, "get_world_state"):
             return jax_packages.flatten_tree(self.env.get_world_state(state))
-        return self._pad(observations).ravel() if self._from_observations else jnp.zeros(0)
+        return self._pad(observations).ravel() if self._credit_from_state else jnp.zeros(0)
 
     def _read_masks(self, state: JaxMARLState) -> Bool[Array, "agents action"]:
         available = jnp.asarray(self.layout.available)

@@ -10,7 +10,14 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from lare_rl.envs.env_errors import NoTimeLimitError
-from lare_rl.envs.jax_packages import AgentEnv, action_fields, construct, import_package, mask_combinations, unusable
+from lare_rl.envs.jax_packages import (
+    AgentEnv,
+    action_fields,
+    construct,
+    import_package,
+    mask_combinations,
+    unusable_error,
+)
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["make", "observed_arrays"]
@@ -50,7 +57,7 @@ def make(task: TaskSpec, **_: Any) -> AgentEnv:
     def read(timestep: Any, steps: Any) -> dict[str, Any]:
         if timestep.reward.shape:
             agents = f"each of its {len(timestep.reward)} agents has rewards"
-            raise unusable(task.environment, f"{agents}, and LaRe's adapter of Jumanji has one agent")
+            raise unusable_error(task.environment, f"{agents}, and LaRe's adapter of Jumanji has one agent")
         is_terminal = timestep.last() & (timestep.discount == 0)
         mask = _find_mask(timestep.observation) if action_spec["discrete"] else None
         return {

@@ -75,7 +75,7 @@ def agent_kind(name: Any) -> str:
 
 
 def group_by_team(names: Sequence[Any], task: TaskSpec) -> tuple[list[Any], tuple[Team, ...]]:
-    """Return the agents' names, team after team, and the teams.
+    """Return the agents' names, team after team, and the teams. Around a single team, the others are where a draft's teams have them.
 
     Raises `LareError` if an agent is in no team or in several, or if a team has no agents.
     """
@@ -85,9 +85,14 @@ def group_by_team(names: Sequence[Any], task: TaskSpec) -> tuple[list[Any], tupl
         if not members:
             agents = ", ".join(map(str, names))
             raise LareError(f"task {task.name!r}: no agent is in {team}. The agents are {agents} ({patterns}).")
-    if task.team is not None:  # the file of a single team, whose function is verified
-        rest = [name for name in names if name not in teams[task.team]]
-        return _make_teams(teams | ({f"not {task.team}": rest} if rest else {}))
+    if task.team is not None:  # the file of a single team, whose function is verified on agents in the order of a draft
+        members = teams[task.team]
+        earlier = set(map(agent_kind, names[: names.index(members[0])]))
+        rest = [name for name in names if name not in members]
+        before = [name for name in rest if agent_kind(name) in earlier]
+        after = [name for name in rest if name not in before]
+        teams = {f"before {task.team}": before, task.team: members, f"after {task.team}": after}
+        return _make_teams({team: agents for team, agents in teams.items() if agents})
     for name in names:
         memberships = [team for team, members in teams.items() if name in members]
         if len(memberships) != 1:

@@ -70,7 +70,7 @@ class ParallelHost:
             raise NoTimeLimitError(task)
         self._available = self.layout.available
         self._masks_actions = any(agent.observes_mask for agent in agents) or not self._available.all()
-        self._credit_from_state = any(role.credit_scope == "state" for role in (task, *task.teams))
+        self._credit_from_state = task.credit_scope == "state"
         self._state: np.ndarray | None = None
         self._state_failed = False
         self._alive = np.zeros(len(agents), bool)

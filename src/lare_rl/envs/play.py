@@ -140,7 +140,14 @@ def _stack(timesteps: Sequence[Timestep]) -> Timestep:
 def play_steps(
     env: HostEnv, policy: Policy | None, rng: np.random.Generator, seed: int
 ) -> Iterator[tuple[Timestep, np.ndarray, Timestep]]:
-    """Play an episode. Yield the timestep before each step, the action in the environment's units, and the timestep after it."""
+    """Play an episode. Yield the timestep before each step, the action in the environment's units, and the timestep after it.
+
+    Raises `LareError` if the environment fails, or if a policy does not fit it.
+    """
+    if policy is not None and env.spec.n_agents > 1:
+        raise LareError(
+            f"a policy plays a single agent, and the environment has {env.spec.n_agents}: leave the policy out"
+        )
     if isinstance(policy, StatefulPolicy):
         policy.reset()
         policy = policy.select_env_action

@@ -104,7 +104,7 @@ def adapt_robot(
         if isinstance(observation, Mapping):
             if OBSERVATION not in observation:
                 keys = ", ".join(observation)
-                raise jax_packages.unusable(task.environment, f"it observes {keys}, but not {OBSERVATION!r}")
+                raise jax_packages.unusable_error(task.environment, f"it observes {keys}, but not {OBSERVATION!r}")
             observation, privileged = observation[OBSERVATION], observation.get(PRIVILEGED, ())
         return jax_packages.flatten_tree(observation), jax_packages.flatten_tree(privileged)
 
@@ -116,7 +116,8 @@ def adapt_robot(
     def step(state: RobotState, action: Array, key: Array) -> tuple[RobotState, dict[str, Any]]:
         env_state, reward = state.env, jnp.zeros(())  # the key is not used: the package's state has its own
         for _ in range(action_repeat):
-            env_state = env.step(_copy(env_state), action)
+            # A step of the packages writes into the dictionaries of its argument: give it new ones.
+            env_state = env.step(jax.tree.map(lambda leaf: leaf, env_state), action)
             reward += env_state.reward
         observation, privileged = observe(env_state)
         is_finite = jnp.isfinite(observation).all() & jnp.isfinite(privileged).all() & jnp.isfinite(reward)
@@ -135,14 +136,8 @@ def adapt_robot(
             "measures": jax.tree.map(lambda value: jnp.where(jnp.isfinite(value), value, 0.0), env_state.metrics),
         }
 
-    def draw_robot(states: list[RobotState]) -> Sequence[Any]:
-        return draw([state.env for state in states])
-
     # Playground's own algorithms act in [-1, 1] as well.
     action_spec = jax_packages.bounded_action(-1.0, 1.0, (env.action_size,), task.environment)
-    return AgentEnv(task, env, reset, step, draw_robot, max_steps=max_steps, **action_spec)
-
-
-def _copy(state: Any) -> Any:
-    """Return a state with new dictionaries, because a step of the packages writes into those of its argument."""
-    return jax.tree.map(lambda leaf: leaf, state)
+    return AgentEnv(
+        task, env, reset, step, lambda states: draw([state.env for state in states]), max_steps=max_steps, **action_spec
+    )

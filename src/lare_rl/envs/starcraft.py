@@ -70,7 +70,7 @@ class StarCraft:
         return self._env
 
     def reset(self, seed: int) -> Timestep:
-        """Start an episode. The seed acts only if StarCraft II starts anew: at first, and after an episode that did not end."""
+        """Start an episode. The seed acts only if StarCraft II starts anew: until an episode has ended, and after a crash."""
         # Before an episode has ended, SMAC's reset would start StarCraft II again, in addition to the running process.
         if not self._can_reset:
             self._new_env(seed)

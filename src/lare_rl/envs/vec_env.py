@@ -125,13 +125,14 @@ def check_lengths(spec: EnvSpec, length: Integer[np.ndarray, " n"], ended: Bool[
 
 
 def check_jax_env(env: JaxEnv, owner: str) -> None:
-    """Raise `EnvOutputError` if a timestep of `reset` or `step` does not match the specification."""
+    """Raise `LareError` if `reset` or `step` fails, or returns a timestep that does not match the specification."""
     import jax  # worker processes import this module and do without JAX
 
     batch, key = empty_batch(env.spec, 1), jax.random.key(0)
-    state, first = jax.eval_shape(env.reset, key)
     action = jax.ShapeDtypeStruct((env.spec.n_agents, env.spec.action_size), np.float32)
-    _, second = jax.eval_shape(env.step, state, action, key)
+    with one_line_errors(f"environment {owner!r} cannot be compiled"):
+        state, first = jax.eval_shape(env.reset, key)
+        _, second = jax.eval_shape(env.step, state, action, key)
     for function, timestep in (("reset", first), ("step", second)):
         _check_shapes(timestep, batch, owner, function)
         for name, column, value in zip(Timestep._fields[:-1], batch[:-1], timestep[:-1], strict=True):

@@ -27,32 +27,22 @@ def draw_frames(
     scale = 0.0 if credit is None else float(np.abs(credit).max())
 
     def paint(axes: Axes, step: int) -> None:
-        _paint(axes, task, positions[step], side, None if credit is None else credit[step], scale)
+        position = positions[step]
+        axes.set(xlim=(-side, side), ylim=(-side, side), aspect="equal")
+        axes.axis("off")
+        square, width = (-task.half_side, -task.half_side), 2 * task.half_side
+        axes.add_patch(patches.Rectangle(square, width, width, fill=False, edgecolor="#dddddd"))
+        n_team, n_moving, n_landmarks = task.teams[0].stop, task.world.n_moving, len(position) - task.world.n_moving
+        colours: list = [TEAM_COLOUR] * n_team + [OTHER_COLOUR] * (n_moving - n_team) + [LANDMARK_COLOUR] * n_landmarks
+        edges = (["#333333"] * n_moving if credit is None else colours[:n_moving]) + ["none"] * n_landmarks
+        if credit is not None:
+            colours[: task.n_agents] = map(tuple, CREDIT_COLOURS(0.5 + 0.4 * np.asarray(credit[step]) / (scale or 1.0)))
+        for entity in (*range(n_moving, len(position)), *range(n_moving)):  # landmarks first
+            radius, colour = max(float(task.world.radius[entity]), 0.008 * side), colours[entity]
+            style = {"facecolor": colour, "edgecolor": edges[entity], "linewidth": 1}
+            axes.add_patch(patches.Circle(tuple(position[entity]), radius, **style))
+        if credit is not None:
+            for (x, y), size, value in zip(position, task.world.radius, credit[step], strict=False):
+                axes.text(x, y + size + 0.01 * side, f"{value:.2g}", fontsize=8, ha="center", va="bottom")
 
     return paint_frames(len(positions), paint)
-
-
-def _paint(
-    axes: Axes,
-    task: ParticleTask,
-    position: Float[np.ndarray, "entities 2"],
-    side: float,
-    credit: Float[np.ndarray, " agents"] | None,
-    scale: float,
-) -> None:
-    axes.set(xlim=(-side, side), ylim=(-side, side), aspect="equal")
-    axes.axis("off")
-    square = (-task.half_side, -task.half_side)
-    axes.add_patch(patches.Rectangle(square, 2 * task.half_side, 2 * task.half_side, fill=False, edgecolor="#dddddd"))
-    n_team, n_moving, n_landmarks = task.teams[0].stop, task.world.n_moving, len(position) - task.world.n_moving
-    colours: list = [TEAM_COLOUR] * n_team + [OTHER_COLOUR] * (n_moving - n_team) + [LANDMARK_COLOUR] * n_landmarks
-    edges = (["#333333"] * n_moving if credit is None else colours[:n_moving]) + ["none"] * n_landmarks
-    if credit is not None:
-        colours[: task.n_agents] = map(tuple, CREDIT_COLOURS(0.5 + 0.4 * np.asarray(credit) / (scale or 1.0)))
-    for entity in (*range(n_moving, len(position)), *range(n_moving)):  # landmarks first
-        radius, edge = max(float(task.world.radius[entity]), 0.008 * side), edges[entity]
-        circle = patches.Circle(tuple(position[entity]), radius, facecolor=colours[entity], edgecolor=edge, linewidth=1)
-        axes.add_patch(circle)
-    if credit is not None:
-        for (x, y), size, value in zip(position, task.world.radius, credit, strict=False):
-            axes.text(x, y + size + 0.01 * side, f"{value:.2g}", fontsize=8, ha="center", va="bottom")

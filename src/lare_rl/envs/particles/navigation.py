@@ -19,7 +19,7 @@ from lare_rl.envs.particles import views
 from lare_rl.envs.particles.task import ParticleTask
 from lare_rl.envs.particles.world import State, World, at_rest
 
-__all__ = ["SIZES", "Size", "make_layouts", "navigation"]
+__all__ = ["SIZES", "Size", "navigation"]
 
 AGENT_RADIUS, LANDMARK_RADIUS = 0.15, 0.05
 SENSITIVITY = 5.0
@@ -86,7 +86,7 @@ def _reset(size: Size, key: PRNGKeyArray) -> State:
     """Place agents uniformly in the square, and landmarks at the points of a random layout."""
     agents_key, landmarks_key = jax.random.split(key)
     agents = jax.random.uniform(agents_key, (size.n_agents, 2), minval=-size.half_side, maxval=size.half_side)
-    layouts = jnp.asarray(make_layouts(size.n_agents, size.half_side, SEPARATION))
+    layouts = jnp.asarray(_make_layouts(size))
     landmarks = layouts[jax.random.randint(landmarks_key, (), 0, len(layouts))]
     return at_rest(jnp.concatenate([agents, landmarks]))
 
@@ -108,34 +108,34 @@ def _reward(size: Size, state: State) -> Float[Array, " agents"]:
 
 
 @cache
-def make_layouts(n_points: int, half_side: float, separation: float) -> Float[np.ndarray, "layouts n_points 2"]:
-    """Return N_LAYOUTS layouts of points within ±half_side, which are further apart than `separation`.
+def _make_layouts(size: Size) -> Float[np.ndarray, "layouts landmarks 2"]:
+    """Return N_LAYOUTS layouts of landmarks in the square, which are further apart than SEPARATION.
 
     A layout is a uniform choice among the points of a Poisson disc sample that has enough of them. The result is always the same.
     """
     rng = np.random.default_rng(0)
     layouts: list[np.ndarray] = []
     while sum(map(len, layouts)) < N_LAYOUTS:
-        samples = _sample_poisson_discs(rng, N_LAYOUTS // 2, 2 * half_side, separation)
+        samples = _sample_poisson_discs(rng, N_LAYOUTS // 2, 2 * size.half_side)
         # A random order of the points, with the missing points last.
         rank = np.where(np.isinf(samples[..., 0]), np.inf, rng.random(samples.shape[:2]))
-        order = np.argsort(rank, axis=1)[:, :n_points]
+        order = np.argsort(rank, axis=1)[:, : size.n_agents]
         candidates = np.take_along_axis(samples, order[..., None], axis=1)
         layouts.append(candidates[np.isfinite(candidates).all(axis=(1, 2))])
-    return (np.concatenate(layouts)[:N_LAYOUTS] - half_side).astype(np.float32)
+    return (np.concatenate(layouts)[:N_LAYOUTS] - size.half_side).astype(np.float32)
 
 
 def _sample_poisson_discs(
-    rng: np.random.Generator, n_samples: int, side: float, separation: float
+    rng: np.random.Generator, n_samples: int, side: float
 ) -> Float[np.ndarray, "n_samples max_points 2"]:
     """Return Poisson disc samples of a square (0, side)^2, computed in lockstep. Missing points of smaller samples are `inf`.
 
     Bridson's algorithm starts with one active point, uniform in the square. It then chooses an active point at random and tries
-    N_CANDIDATES points, uniform in the ring of separation to 2 * separation around it. Candidates that are further than `separation`
+    N_CANDIDATES points, uniform in the ring of SEPARATION to 2 * SEPARATION around it. Candidates that are further than SEPARATION
     from all existing points are added and become active; the selected point becomes inactive. It ends if no point is active.
     """
-    # Discs with a radius of half the separation do not overlap, and lie within a square of side + separation.
-    max_points = int((side + separation) ** 2 / (np.pi * separation**2 / 4))
+    # Discs with a radius of half of SEPARATION do not overlap, and lie within a square of side + SEPARATION.
+    max_points = int((side + SEPARATION) ** 2 / (np.pi * SEPARATION**2 / 4))
     points = np.full((n_samples, max_points, 2), np.inf)
     points[:, 0] = side * rng.random((n_samples, 2))
     active = np.zeros((n_samples, max_points), bool)
@@ -149,10 +149,10 @@ def _sample_poisson_discs(
         for _ in range(N_CANDIDATES):
             angle, u = 2 * np.pi * rng.random(len(running)), rng.random(len(running))
             # The root of 1 + 3 u makes the candidates uniform by area between 1 and 2 separations.
-            distance = separation * np.sqrt(1 + 3 * u)
+            distance = SEPARATION * np.sqrt(1 + 3 * u)
             point = points[running, centre] + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
             offset = points[running, :used] - point[:, None]
-            is_far = (offset[..., 0] ** 2 + offset[..., 1] ** 2 > separation**2).all(axis=1)
+            is_far = (offset[..., 0] ** 2 + offset[..., 1] ** 2 > SEPARATION**2).all(axis=1)
             is_new = is_far & ((point >= 0) & (point < side)).all(axis=1)
             sample = running[is_new]
             points[sample, n_points[sample]] = point[is_new]

@@ -32,7 +32,6 @@ __all__ = [
     "competitive",
     "logits",
     "make_world",
-    "observe_predators",
     "observe_preys",
     "predator_prey",
     "reset",
@@ -40,7 +39,6 @@ __all__ = [
     "reward_preys",
     "sample_actions",
     "shipped_prey",
-    "touches",
 ]
 
 PREDATOR_SENSITIVITY, PREY_SENSITIVITY = 3.0, 4.0
@@ -113,7 +111,7 @@ def predator_prey(name: str) -> ParticleTask:
         half_side=size.half_side,
         world=make_world(size),
         reset=partial(reset, size),
-        observe=partial(observe_predators, size),
+        observe=partial(_observe_predators, size),
         reward=partial(reward_predators, size),
         script=lambda state, key: sample_actions(shipped_prey(), observe_preys(size, state), key),
     )
@@ -129,7 +127,7 @@ def competitive() -> ParticleTask:
         half_side=size.half_side,
         world=make_world(size),
         reset=partial(reset, size),
-        observe=lambda state: jnp.concatenate([observe_predators(size, state), observe_preys(size, state)]),
+        observe=lambda state: jnp.concatenate([_observe_predators(size, state), observe_preys(size, state)]),
         reward=lambda state: jnp.concatenate([reward_predators(size, state), reward_preys(size, state)]),
     )
 
@@ -160,7 +158,7 @@ def reset(size: Size, key: PRNGKeyArray) -> State:
     )
 
 
-def observe_predators(size: Size, state: State) -> Float[Array, "predators observation"]:
+def _observe_predators(size: Size, state: State) -> Float[Array, "predators observation"]:
     return _observe(size, state, size.predators, size.predator_view)
 
 
@@ -182,7 +180,7 @@ def _observe(size: Size, state: State, observers: range, view: View) -> Float[Ar
     )
 
 
-def touches(size: Size, state: State) -> Float[Array, "predators preys"]:
+def _touches(size: Size, state: State) -> Float[Array, "predators preys"]:
     """Return 1 where a predator touches a prey."""
     distance = views.distances(state.position, size.predators, size.preys)
     return (distance < size.predator_radius + size.prey_radius).astype(jnp.float32)
@@ -190,11 +188,11 @@ def touches(size: Size, state: State) -> Float[Array, "predators preys"]:
 
 def reward_predators(size: Size, state: State) -> Float[Array, " predators"]:
     to_prey = jnp.min(views.distances(state.position, size.predators, size.preys), axis=1)
-    return CATCH * jnp.sum(touches(size, state), axis=1) - DISTANCE_WEIGHT * to_prey
+    return CATCH * jnp.sum(_touches(size, state), axis=1) - DISTANCE_WEIGHT * to_prey
 
 
 def reward_preys(size: Size, state: State) -> Float[Array, " preys"]:
-    return -CATCH * jnp.sum(touches(size, state), axis=0)
+    return -CATCH * jnp.sum(_touches(size, state), axis=0)
 
 
 # Scripted preys

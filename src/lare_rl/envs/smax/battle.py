@@ -33,7 +33,6 @@ __all__ = [
     "sample_cooldown_noise",
     "separate_units",
     "start_battle",
-    "within_reach",
     "won",
 ]
 
@@ -97,7 +96,7 @@ def advance(
 
     def tick(battle: Battle, cooldown_noise: Float[Array, " units"]) -> tuple[Battle, None]:
         is_alive = alive(battle)
-        hits = aims & within_reach(scenario, battle) & (battle.cooldown <= 0)[:, None]
+        hits = aims & _within_reach(scenario, battle) & (battle.cooldown <= 0)[:, None]
         damage = jnp.sum(jnp.where(hits, scenario.unit_stats("damage")[:, None], 0), axis=0)
         reloaded = scenario.unit_stats("cooldown") + cooldown_noise
         cooldown = jnp.where(jnp.any(hits, axis=1), reloaded, battle.cooldown - TICK)
@@ -131,7 +130,7 @@ def distances(position: Float[Array, "units 2"]) -> Float[Array, "units units"]:
     return jnp.sqrt((x[:, None] - x) ** 2 + (y[:, None] - y) ** 2)
 
 
-def within_reach(scenario: Scenario, battle: Battle) -> Bool[Array, "units units"]:
+def _within_reach(scenario: Scenario, battle: Battle) -> Bool[Array, "units units"]:
     """Return at [i, j] whether unit i could hit unit j: both are alive, and the distance is small enough."""
     is_alive = alive(battle)
     return (distances(battle.position) < scenario.unit_stats("attack_range")[:, None]) & is_alive[:, None] & is_alive
@@ -155,7 +154,7 @@ def available_actions(scenario: Scenario, battle: Battle) -> Bool[Array, "allies
     """Return the available actions of our units. Dead units can only stop; others can attack enemies within their reach."""
     is_alive = alive(battle)[: scenario.n_allies, None]
     move = jnp.repeat(is_alive, len(DIRECTIONS), axis=1)
-    attack = within_reach(scenario, battle)[: scenario.n_allies, scenario.n_allies :]
+    attack = _within_reach(scenario, battle)[: scenario.n_allies, scenario.n_allies :]
     return jnp.concatenate([move, jnp.ones_like(is_alive), attack], axis=1)
 
 

@@ -54,11 +54,11 @@ class SMAX:
         self.scenario = scenario = find_scenario(name)
         self.spec = EnvSpec(
             teams=(Team("ally", 0, scenario.n_allies),),
-            observation_size=_observation_size(scenario),
+            observation_size=(scenario.n_units - 1) * (7 + scenario.n_unit_types) + 4 + scenario.n_unit_types,
             action_size=ATTACK + scenario.n_enemies,
             discrete=True,
             max_steps=scenario.max_steps,
-            state_size=_state_size(scenario),
+            state_size=scenario.n_units * (6 + scenario.n_unit_types),
             agents_leave=True,
             masks_actions=True,
             is_jax=True,
@@ -113,14 +113,6 @@ def reward(scenario: Scenario, battle: Battle, next_battle: Battle) -> Float[Arr
 
 
 # Observations and state, with the layout of JaxMARL's SMAX
-
-
-def _observation_size(scenario: Scenario) -> int:
-    return (scenario.n_units - 1) * (7 + scenario.n_unit_types) + 4 + scenario.n_unit_types
-
-
-def _state_size(scenario: Scenario) -> int:
-    return scenario.n_units * (6 + scenario.n_unit_types)
 
 
 def _one_hot_unit_types(scenario: Scenario) -> Float[np.ndarray, "units unit_types"]:
