@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from helpers.credit_specs import observation_spec
-from helpers.decoder_toys import decoder_rewards, observed_state
+from helpers.decoder_toys import decoder_rewards, make_decoder, observed_state
 from helpers.numpy_attention import numpy_attention, numpy_layer_norm, numpy_linear
 from lare_rl.credit import descent
 from lare_rl.credit.arel import Block
@@ -28,6 +28,11 @@ def test_block_against_numpy():
     first, second = block.feed_forward.layers
     want = numpy_layer_norm(y + numpy_linear(second, np.maximum(numpy_linear(first, y), 0)), 1e-5)
     np.testing.assert_allclose(block(jnp.asarray(x), causal_mask(STEPS)), want, rtol=1e-3, atol=1e-4)
+
+
+def test_a_single_step_has_no_variance():
+    decoder = make_decoder("arel", FEATURES, 1, AGENTS)
+    assert not jax.jit(lambda rows: decoder(rows, KEY).penalty)(ROWS).any()
 
 
 @pytest.mark.long

@@ -123,6 +123,7 @@ def test_loss_of_a_decoder_is_required(registered, monkeypatch):
         (Fit.SIGNS, "additive", "'linear'"),
         (Fit.LIKELIHOOD, "step", "standard deviation"),
         (Fit.DECODER_LOSS, "step", "loss"),
+        (Fit.SAMPLED_STEPS, "arel", "the decoder 'arel' all of them"),
     ],
 )
 def test_register_refuses_a_fit_without_its_decoder(fit, decoder, message, registered):
@@ -131,6 +132,9 @@ def test_register_refuses_a_fit_without_its_decoder(fit, decoder, message, regis
 
 
 def test_register_refuses(registered):
+    for inputs in (methods.SCORED_AND_HISTORY, input_names.InputNames(("action",), ("action", "history"))):
+        with pytest.raises(LareError, match="mine: the input history needs a fit in closed form"):
+            register_method(Method("mine", "mine", "this test", inputs, Fit.ALL_STEPS))
     with pytest.raises(LareError, match="another method 'rd'"):
         register_method(Method("rd", "mine", "this test", methods.RAW, Fit.ALL_STEPS))
     with pytest.raises(LareError, match="no decoder 'nothing'"):

@@ -90,6 +90,6 @@ class AREL(eqx.Module):
             x = jnp.swapaxes(agent_block(jnp.swapaxes(x, 1, 2), None), 1, 2)
         first, second, last = self.read_out
         y = math.sqrt(steps) * last(jnp.sum(second(first(x)), axis=1))[..., 0]
-        penalty = VARIANCE_PENALTY / steps**2 * jnp.var(y, axis=1, ddof=1, keepdims=True)
+        penalty = VARIANCE_PENALTY / steps**2 * jnp.var(y, axis=1, ddof=min(1, steps - 1), keepdims=True)
         outputs = y, jnp.broadcast_to(penalty, y.shape)
         return DecoderOutput(*(jnp.broadcast_to(values.reshape(rows, 1), (rows, agents)) for values in outputs))

@@ -33,7 +33,6 @@ from lare_rl.credit.history import next_history
 __all__ = [
     "MAX_PAIRED_RAW_FEATURES",
     "MAX_RAW_FEATURES",
-    "N_FREQUENCIES",
     "Basis",
     "expand",
     "expand_history",
@@ -46,7 +45,8 @@ N_FREQUENCIES = 3
 HALF_PERIOD = 4.0
 """Shapes are constant beyond this number of standard deviations from the mean."""
 MAX_FEATURES = 512
-"""The maximum number of features. If the shapes of raw features would exceed it, these get fewer frequencies, or none."""
+"""If there would be more features, shapes of raw features have fewer frequencies, or none. Pairs of raw features and histories do not
+count."""
 MAX_HISTORY_FEATURES = 192
 """The maximum number of shapes of largest, smallest and last values."""
 MAX_PAIRED_RAW_FEATURES = 12

@@ -187,7 +187,9 @@ def fit(
     if state.log_odds is not None:
         log_odds = logistic.fit(state.log_odds, basis.column_group_index, max_rounds)
         state = state._replace(log_odds=log_odds)
-        weights = jax.tree.map(lambda *rows: jnp.concatenate(rows), weights, _log_odds_weights(log_odds))
+        start_value, slope = logistic.to_returns(log_odds)
+        log_odds_weights = _Weights(slope * log_odds.posterior.weight[None], jnp.zeros(1), start_value[None])
+        weights = jax.tree.map(lambda *rows: jnp.concatenate(rows), weights, log_odds_weights)
     return _set_weights(state, weights)
 
 
@@ -209,29 +211,23 @@ def _fit_linear_types(
 
 
 def _score_type_statistics(state: ClosedForm, score_type: Int[Array, ""] | int) -> SufficientStatistics:
-    """Return the sums for a fit. Its columns must have about the same size, so 1/T is divided by its mean."""
+    """Return the sums for a fit. Its columns must have about the same size, so 1/T is divided by its mean.
+
+    Unless the score is a sum, 1/T has the weight 0: an average has a constant part already.
+    """
     statistics, basis = to_float64(state.sufficient_statistics), state.decoder.basis
     if not basis.start_value:
         return statistics
     unit = jnp.ones(len(statistics.mean)).at[basis.n_features].set(_start_value_unit(state))
-    products = statistics.products * jnp.outer(unit, unit)
-    return _drop_start_value(
-        statistics._replace(mean=statistics.mean * unit, products=products), basis.n_features, score_type
-    )
+    is_used = (np.arange(len(unit)) != basis.n_features) | (score_type == ScoreType.SUM)
+    products = jnp.where(jnp.outer(is_used, is_used), statistics.products * jnp.outer(unit, unit), 0)
+    return statistics._replace(mean=statistics.mean * unit, products=products)
 
 
 def _start_value_unit(state: ClosedForm) -> Float[Array, ""]:
     """Return what the column 1/T is multiplied by, the inverse of its mean."""
     mean = to_float64(state.sufficient_statistics).mean[state.decoder.basis.n_features]
     return 1 / jnp.where(mean > 0, mean, 1)
-
-
-def _drop_start_value(
-    statistics: SufficientStatistics, column: int, score_type: Int[Array, ""] | int
-) -> SufficientStatistics:
-    """Return the sums by which 1/T, at `column`, has the weight 0 unless the score is a sum: an average has a constant part already."""
-    is_used = (np.arange(len(statistics.mean)) != column) | (score_type == ScoreType.SUM)
-    return statistics._replace(products=jnp.where(jnp.outer(is_used, is_used), statistics.products, 0))
 
 
 def _linear_weights(
@@ -255,11 +251,6 @@ def _centre_average(state: ClosedForm, weights: _Weights, index: int) -> _Weight
     mean = jnp.sum(state.sufficient_statistics.mean[..., state.decoder.basis.n_columns + ScoreType.AVERAGE])
     bias, start_value = weights.bias.at[index].add(-mean), weights.start_value.at[index].add(mean)
     return weights._replace(bias=bias, start_value=start_value)
-
-
-def _log_odds_weights(log_odds: LogOddsFit) -> _Weights:
-    start_value, slope = logistic.to_returns(log_odds)
-    return _Weights(slope * log_odds.posterior.weight[None], jnp.zeros(1), start_value[None])
 
 
 def target_scale(state: ClosedForm, *, is_average: Bool[Array, ""], index: Int[Array, ""] | int) -> Float[Array, ""]:

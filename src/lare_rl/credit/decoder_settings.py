@@ -39,7 +39,7 @@ class CreditSettings(CheckedModel):
     average has predicted returns clearly better."""
     start_value: bool = True
     """If lengths differ, a sum may have a part that does not grow with the number of steps, and that no step is paid for. Gradient
-    decoders: only if `score` is `auto`."""
+    decoders: not if `score` is `sum`."""
     exact: Literal["auto", "no", "last", "spread"] = "auto"
     """Make proxy rewards add up to the return: correct the `last` step, or `spread` the correction over all steps. `auto`:
     `last` for bayes-progress and lare-bayes-progress, else `no`."""

@@ -54,7 +54,8 @@ __all__ = ["NOTICEABLE_SHARE", "Explanation", "ExplanationState", "add_to_explan
 MAX_EXPLANATION_ROUNDS = 100
 """The maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
 NOTICEABLE_SHARE = 0.05
-"""Nothing is said about the effect of a factor, or about a raw feature, with a smaller share. A raw feature with a larger one is used."""
+"""With a smaller share, a raw feature is not named as important, nor a factor's effect as curved. With a larger one, a raw feature is
+used."""
 MIN_MEAN_STD = 1e-5
 """The means of a standardised factor over episodes vary by more than rounding if their standard deviation exceeds this."""
 MIN_SAME = 1 - 2e-6

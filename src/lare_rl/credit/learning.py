@@ -49,7 +49,7 @@ batches."""
 
 
 def is_fitted(state: DecoderState) -> Bool[Array, ""]:
-    """Return whether the decoder has learned anything yet."""
+    """Return whether the decoder has learned anything yet. Its method must have a fit."""
     if state.closed_decoder is not None:
         return state.closed_decoder.n_fitted > 1  # from one episode it only learns the mean reward
     return optax.tree_utils.tree_get(state.optimizer, "count") > 0
@@ -232,7 +232,7 @@ def find_score_mismatch(state: DecoderState, spec: CreditSpec) -> Literal["looks
     """Return how the last returns disagree with the score that is set.
 
     "looks_binary": they have two values, and the score is not set to be won or lost. "not_binary": the reverse. None if they agree,
-    for few returns, and for a method that cannot fit log odds.
+    for few or equal returns, and for a method that cannot fit log odds.
     """
     n_returns = min(int(state.predictions.n_episodes), len(state.predictions.returns))
     returns = np.sort(np.asarray(state.predictions.returns)[:n_returns])

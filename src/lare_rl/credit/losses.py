@@ -111,8 +111,8 @@ def step_loss(
         (r_hat(x_t) - L (F_t - F_{t-1}))^2,    F_{-1} = 0
 
     `prefix_returns` is F_t, the sum of the rewards of the steps 0 to t by the model of episodes, divided by L times the scale; no
-    gradient goes to it. L is the number of rows of an episode with its padding: the steps of the longest episode or, in the assigner,
-    a little more. The scale is the root mean square of R/T. The step model predicts the reward divided by the scale.
+    gradient goes to it. L is the number of rows of an episode with its padding: the steps of the longest episode, which the assigner
+    rounds up to a power of two. The scale is the root mean square of R/T. The step model predicts the reward divided by the scale.
     """
     max_steps = inputs.shape[1]
     target = max_steps * jnp.diff(jax.lax.stop_gradient(prefix_returns), axis=1, prepend=0)

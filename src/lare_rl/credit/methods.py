@@ -1,8 +1,8 @@
 """What a method of credit is, and the table of methods: all published ways to assign credit, as inputs + fit + decoder.
 
 A *method* determines the rewards that the algorithm is trained on. `inputs` names what the decoder reads, `fit` the way it is fitted
-to returns, and `decoder` its kind. `dense` and `episodic` fit nothing: `dense` trains on the true rewards, `episodic` on the
-return, which is the reward of the last step. A method works for a single agent and for several, unless its row says otherwise.
+to returns, and `decoder` its kind. `dense`, `episodic`, `ircr` and `llm-reward` fit nothing. A method works for a single agent and for
+several, unless its row says otherwise.
 
 `register_method` adds a method, for this package and for plugins alike.
 """
@@ -204,6 +204,10 @@ def _find_conflict(method: Method) -> str | None:
     if fit.closed_form != kind.closed_form:
         needed = "decoder 'linear' or 'additive'" if fit.closed_form else "decoder with gradients"
         return f"Fit.{fit.name} needs a {needed}, not {decoder!r}"
+    if fit.samples_steps and kind.whole_episodes:
+        return f"Fit.{fit.name} reads some steps of an episode, and the decoder {decoder!r} all of them"
+    if not fit.closed_form and "history" in (*method.inputs.names, *(method.inputs.names_of_many_agents or ())):
+        return "the input history needs a fit in closed form"  # it is NaN before the first step
     if fit in (Fit.LIKELIHOOD, Fit.DECODER_LOSS) and decoder in ("step", "bottleneck"):
         needed = "a standard deviation" if fit is Fit.LIKELIHOOD else "a loss of its own"
         return f"Fit.{fit.name} needs a decoder with {needed}, not {decoder!r}"

@@ -17,7 +17,6 @@ __all__ = [
     "PRIOR_RANGE",
     "TOLERANCE",
     "AlphaIndex",
-    "Alphas",
     "Backend",
     "Features",
     "Moments",

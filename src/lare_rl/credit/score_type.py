@@ -16,7 +16,6 @@ __all__ = [
     "compare_score_types",
     "is_better",
     "score_type_errors",
-    "score_types_to_fit",
 ]
 
 MAX_ERROR_RATIO = 0.95
@@ -46,20 +45,6 @@ class ScoreTypeEstimate(NamedTuple):
     """Whether this type predicts the returns clearly better than its rival."""
     rival: ScoreType
     """The other type that predicts them best."""
-
-
-def score_types_to_fit(score: str, fixed_length: bool, *, allow_log_odds: bool) -> tuple[ScoreType, ...]:
-    """Return the types to fit, in the order of their values.
-
-    Args:
-        score: the setting of this name.
-        fixed_length: whether all episodes have the same length. A sum and an average are then the same.
-        allow_log_odds: whether a score may be log odds. Decoders that are fitted in closed form allow it.
-    """
-    if score in ("sum", "average"):
-        return (ScoreType[score.upper()],)
-    linear = (ScoreType.SUM,) if fixed_length else (ScoreType.SUM, ScoreType.AVERAGE)
-    return (*linear, ScoreType.LOG_ODDS) if score == "binary" and allow_log_odds else linear
 
 
 def is_better(predictions: Predictions, index: int, rival: int) -> Bool[Array, ""]:

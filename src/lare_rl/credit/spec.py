@@ -9,7 +9,7 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.input_names import input_sizes, raw_feature_names
 from lare_rl.credit.methods import Fit, Method
 from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
-from lare_rl.credit.score_type import ScoreType, score_types_to_fit
+from lare_rl.credit.score_type import ScoreType
 from lare_rl.errors import LareError
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import MAX_LEVELS, ScoredObservation
@@ -32,7 +32,7 @@ class CreditSpec:
     agents: int
     """The number of proxy rewards of a step."""
     max_steps: int
-    """The number of steps of the longest episode."""
+    """The number of steps of the longest episode; in training, of the longest segment."""
     fixed_length: bool = False
     """Whether all episodes have the same length. A sum and an average are then the same."""
     payments: PaymentRule = PAID_AT_END
@@ -88,11 +88,14 @@ class CreditSpec:
 
     @cached_property
     def score_types(self) -> tuple[ScoreType, ...]:
-        """The score types that are fitted. Without features, no fit in closed form can compare them."""
+        """The score types that are fitted, in the order of their values. Without features, no fit in closed form can compare them."""
+        score = self.settings.score
         if "score" not in self.method.settings or not self.basis.n_features:
             return (ScoreType.SUM,)
-        allow_log_odds = not self.method.uses_gradient
-        return score_types_to_fit(self.settings.score, self.fixed_length, allow_log_odds=allow_log_odds)
+        if score in ("sum", "average"):
+            return (ScoreType[score.upper()],)
+        linear = (ScoreType.SUM,) if self.fixed_length else (ScoreType.SUM, ScoreType.AVERAGE)
+        return (*linear, ScoreType.LOG_ODDS) if score == "binary" and not self.method.uses_gradient else linear
 
     @property
     def has_closed_form(self) -> bool:

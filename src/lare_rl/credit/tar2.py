@@ -1,12 +1,12 @@
 """TAR2: temporal-agent reward redistribution (Kapoor et al., 2025, arXiv 2502.04864).
 
 Three times, causal attention over the steps of each agent is followed by attention over the agents of each step under random
-coalitions, both as in STAS. The outputs of all layers, h, and the outcome of the episode give contributions. Their sum is fitted to
-the return. The states and the past must tell which action an agent takes next:
+coalitions, both as in STAS. The outputs of all layers, h, and the outcome of the episode give contributions. Their mean is fitted to
+R/T. The states and the past must tell which action an agent takes next:
 
-    c_{i,t} = MLP([h_{i,t}, mean_j h_{j,T-1}]),    no gradient through the second one
+    c_{i,t} = `CreditSpec.output_scale` * MLP([h_{i,t}, mean_j h_{j,T-1}]),    no gradient through the second one
     p(a_{i,t}) = softmax(MLP([mean_j e_{j,t}, h_{i,t-1}])),    h_{i,-1} = 0
-    (sum_{i,t} c_{i,t} - R)^2 - 0.05 mean_{i,t} log p(a_{i,t})
+    (mean_{i,t} c_{i,t} - R/T)^2 - 0.05 mean_{i,t} log p(a_{i,t})
 
 e is the embedding of an observation and its position. The rewards of an episode are not c, but shares of the return
 (`return_shares`).

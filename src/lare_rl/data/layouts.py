@@ -6,7 +6,7 @@ Lengths 3, 2 and 4 give, with 8 rows:
              step    0 1 2  0 1  - - -                      step    0 1 2 2  0 1 1 1  0 1 2 3
 
 `slot` is the index of a row's episode in the batch, and `step` the index of the row's step in that episode. A row that belongs to no
-episode has the number of episodes as its slot. The functions work on arrays of NumPy and of JAX.
+episode has the number of episodes as its slot. The functions that lay steps out work on arrays of NumPy and of JAX.
 """
 
 from typing import Any, NamedTuple

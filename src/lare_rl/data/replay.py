@@ -128,7 +128,7 @@ class StoredSteps(NamedTuple):
     residual: Float[Array, "*batch teams"] | None
     """The return of the step's episode, less the sum of its proxy rewards; 0 if that is unknown. None if it is not stored."""
     level: Int[Array, "*batch"] | None
-    """The level of the step's episode. Valid at the last step."""
+    """The level of the step's episode. Valid if it has ended."""
     length: Int[Array, "*batch"]
     """T of the step's episode. While it is running: its steps so far, but at least the mean length of finished episodes."""
 
