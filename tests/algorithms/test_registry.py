@@ -16,6 +16,9 @@ def test_rows_and_what_register_algorithm_refuses():
         message = f"algorithm mine: .* consumes {ALGORITHMS[name].consumes} derive from .*:{base}"
         with pytest.raises(LareError, match=message):
             register_algorithm(replace(ALGORITHMS[name], name="mine", settings=ALGORITHMS["ppo"].settings))
+    for name, changes in (("td3", {"discrete": True}), ("sac", {"multi_agent": True}), ("vdn", {"continuous": True})):
+        with pytest.raises(LareError, match=r"algorithm mine: .* consumes .* trains .*False"):
+            register_algorithm(replace(ALGORITHMS[name], name="mine", **changes))
     algorithm = replace(ALGORITHMS["ppo"], name="mine")
     object.__setattr__(algorithm, "consumes", "rollouts")  # type checks are only made in tests
     with pytest.raises(LareError, match="algorithm mine: consumes is 'rollouts'"):

@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.numpy_twins import equal, mlp_forward, q_values, random_transitions
+from helpers.numpy_attention import numpy_mlp
+from helpers.numpy_twins import equal, q_values, random_transitions
 from lare_rl.algorithms.sac import SACSettings, sac
 from lare_rl.nn.networks import MLP
 
@@ -21,7 +22,7 @@ def state():
 
 def numpy_sample(state, observation, key):
     """Return actions and log pi in double precision."""
-    mean, log_std = np.split(mlp_forward(state.online.actor, np.asarray(observation)).astype(np.float64), 2, axis=1)
+    mean, log_std = np.split(numpy_mlp(state.online.actor, np.asarray(observation)).astype(np.float64), 2, axis=1)
     sigma = np.exp(log_std)
     u = mean + sigma * np.asarray(jax.random.normal(key, mean.shape))
     density = np.exp(-0.5 * ((u - mean) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
@@ -35,7 +36,7 @@ def test_sample(state):
     np.testing.assert_allclose(log_pi, expected_log_pi, rtol=1e-4)
     noise = jax.random.normal(KEY, action.shape)
     np.testing.assert_allclose(sac.explore(state.online.actor, BATCH.observation, noise, SETTINGS), action, rtol=1e-5)
-    mode = np.tanh(mlp_forward(state.online.actor, np.asarray(BATCH.observation))[:, :2])
+    mode = np.tanh(numpy_mlp(state.online.actor, np.asarray(BATCH.observation))[:, :2])
     np.testing.assert_allclose(sac.act(state.online.actor, BATCH.observation), mode, rtol=1e-5, atol=1e-6)
 
 

@@ -3,7 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.numpy_twins import equal, mlp_forward, q_values, random_transitions
+from helpers.numpy_attention import numpy_mlp
+from helpers.numpy_twins import equal, q_values, random_transitions
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.algorithms.td3 import TD3Settings, td3
 
@@ -27,7 +28,7 @@ def state():
 )
 def test_td_targets(settings, noise, state):
     signs = np.sign(jax.random.normal(KEY, BATCH.action.shape))
-    action = np.tanh(mlp_forward(state.target.actor, np.asarray(BATCH.next_observation)))
+    action = np.tanh(numpy_mlp(state.target.actor, np.asarray(BATCH.next_observation)))
     next_q = q_values(state.target.critics, BATCH.next_observation, np.clip(action + noise * signs, -1, 1))
     assert len(next_q) == settings.critics
     expected = BATCH.reward + 0.99 * (1 - BATCH.terminated) * next_q.min(axis=0)

@@ -220,6 +220,7 @@ CHANGES = {
     "short": (lambda t: t._replace(observation=t.observation[:, 1:]), r"observation .*\(3, 3\).*\(3, 4\)"),
     "whole": (lambda t: t._replace(reward=t.reward.astype(int)), "reward of reset has the type int32, not float32"),
     "unmeasured": (lambda t: t._replace(measures={}), "measure 'right'"),
+    "failing": (lambda t: 1 / 0, "'bad-echo/failing' cannot be compiled: division by zero$"),
 }
 
 

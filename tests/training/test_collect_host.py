@@ -257,6 +257,17 @@ def test_collect_locates_bad_outputs(wrap):
         collect(make_envs((4, 9), 2, task=WRAPPED), 40)
 
 
+def test_environments_are_closed_if_those_for_evaluations_cannot_be_made(monkeypatch):
+    envs, closed = local_envs(1), []
+    batches = iter([envs])
+    monkeypatch.setattr(envs, "close", lambda: closed.append(envs))
+    monkeypatch.setattr(collect_host, "n_open_envs", lambda *_: 1)
+    monkeypatch.setattr(collect_host, "make_vec_env", lambda *_, **options: next(batches))
+    with pytest.raises(StopIteration):
+        collect_host.make_host_collector(toy_spec(), small_config("dense", env=envs.spec), (0,), 1)
+    assert closed == [envs]
+
+
 def test_restore_and_evaluate_locate_bad_outputs(wrap):
     """The step is that of the repeated or evaluated episode."""
     envs = make_envs((4,), task=WRAPPED)

@@ -135,3 +135,6 @@ def test_steps_of_other_sizes_are_refused(name):
     values = jnp.stack(2 * [getattr(steps, name)], axis=-1)
     with pytest.raises(LareError, match=rf"{name} has the shape \(20, 4,"):
         credit.reward(credit.init(jax.random.key(0)), steps._replace(**{name: values}))
+    swapped = jnp.swapaxes(getattr(steps, name), 0, 1)
+    with pytest.raises(LareError, match=rf"{name} has the shape \(4, 20"):
+        credit.reward(credit.init(jax.random.key(0)), steps._replace(**{name: swapped}))

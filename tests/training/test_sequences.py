@@ -30,12 +30,9 @@ from lare_rl.nn.normalise import standardise
 from lare_rl.training import sequences
 from lare_rl.training.compiled import compile_functions
 from lare_rl.training.rewards import rewards
+from lare_rl.training.seed_axis import select_seed
 
 qmix_config = partial(small_config, algorithm="qmix", env=ONE_TEAM, n_envs=2)
-
-
-def select_seed(learner, seed=0):
-    return jax.tree.map(lambda leaf: leaf[seed], learner)
 
 
 def add_seed_axis(leaves):

@@ -10,7 +10,7 @@ from lare_rl.algorithms.batches import Action, Observation, PerStep, Transitions
 from lare_rl.algorithms.off_policy import OffPolicySettings
 from lare_rl.nn.networks import MLP, adam_step
 
-__all__ = ["Critics", "bootstrapped_target", "critic_loss", "fit_critics", "init_critics", "q_value", "q_values"]
+__all__ = ["Critics", "bootstrapped_target", "fit_critics", "init_critics", "q_value", "q_values"]
 
 Critics = MLP
 """All critics in one pytree, stacked on a leading axis."""
@@ -37,15 +37,13 @@ def bootstrapped_target(batch: Transitions, next_value: PerStep, gamma: float) -
     return batch.reward + gamma * (1 - batch.terminated) * next_value
 
 
-def critic_loss(critics: Critics, batch: Transitions, target_q: PerStep) -> Float[Array, ""]:
-    """Return the sum over the critics of mean (Q_i(s, a) - y)^2."""
-    return jnp.sum(jnp.mean((q_values(critics, batch.observation, batch.action) - target_q) ** 2, axis=1))
-
-
 def fit_critics(
     critics: Critics, batch: Transitions, target_q: PerStep, optimizer: optax.OptState, learning_rate: float
 ) -> tuple[Critics, optax.OptState, Float[Array, ""]]:
-    """Take a step of Adam on all critics. Return them, the optimizer's state and the loss."""
-    loss, gradient = jax.value_and_grad(critic_loss)(critics, batch, target_q)
-    critics, optimizer = adam_step(critics, gradient, optimizer, learning_rate)
-    return critics, optimizer, loss
+    """Take a step of Adam on all critics. Return them, the optimizer's state and the loss: the sum over i of mean (Q_i(s, a) - y)^2."""
+
+    def loss(critics: Critics) -> Float[Array, ""]:
+        return jnp.sum(jnp.mean((q_values(critics, batch.observation, batch.action) - target_q) ** 2, axis=1))
+
+    loss_before, gradient = jax.value_and_grad(loss)(critics)
+    return *adam_step(critics, gradient, optimizer, learning_rate), loss_before

@@ -34,4 +34,4 @@ class OffPolicySettings(AlgorithmSettings):
 
 def run_defaults(env: "EnvSpec", environments: int | None) -> dict[str, Any]:
     """Return the default run settings."""
-    return {"environments": environments or 1, "evaluate_every": 5000}
+    return {"environments": environments or 1}

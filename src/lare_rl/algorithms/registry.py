@@ -131,7 +131,8 @@ ALGORITHMS = Registry[Algorithm]("algorithm")
 def register_algorithm(algorithm: Algorithm) -> None:
     """Add an algorithm. Its name then works in `Settings(algorithm=...)` and on the command line.
 
-    Raises `LareError` if another algorithm has this name, or if its settings or `consumes` are of the wrong class.
+    Raises `LareError` if another algorithm has this name, if its settings or `consumes` are of the wrong class, or
+    if it promises what no algorithm can do that consumes such data.
     """
     from lare_rl.algorithms.off_policy import OffPolicySettings  # here, because that module imports this one
 
@@ -146,4 +147,14 @@ def register_algorithm(algorithm: Algorithm) -> None:
             f"algorithm {algorithm.name}: the settings of an algorithm that consumes {algorithm.consumes} derive from "
             f"{base.__module__}:{base.__name__}: pass an instance of such a class"
         )
+    kinds = {
+        Consumes.TRANSITIONS: (
+            algorithm.discrete or algorithm.multi_agent,
+            "one agent with continuous actions: pass discrete=False, multi_agent=False",
+        ),
+        Consumes.SEQUENCES: (algorithm.continuous, "discrete actions: pass continuous=False"),
+    }
+    is_impossible, kind = kinds.get(algorithm.consumes, (False, ""))
+    if is_impossible:
+        raise LareError(f"algorithm {algorithm.name}: one that consumes {algorithm.consumes} trains {kind}")
     ALGORITHMS.register(algorithm.name, algorithm)

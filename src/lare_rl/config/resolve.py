@@ -73,7 +73,9 @@ def _apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
     defaults: dict[str, Any] = {
         "method": "lare-bayes",
         "steps": 1_000_000,
+        "environments": 1,
         "rollout_steps": 50,
+        "evaluate_every": 5000,
         "capacity": 1_000_000,
         "fit_every": 1,
         "fit_updates": 1,

@@ -239,7 +239,5 @@ def replay_rows(settings: ResolvedSettings, max_steps: int) -> int:
     rows = settings.capacity // settings.environments
     if not reads_old_steps(settings):  # only to compare the newest rewards with the true ones
         rows = required + RECENT_STEPS // settings.environments
-    all_rows = (
-        2 * settings.steps // settings.environments + 2
-    )  # of the run, if every episode has one step, which takes two rows
-    return min(rows, max(required, all_rows))
+    max_rows = 2 * settings.steps // settings.environments + 2  # if every episode has one step, which takes two rows
+    return min(rows, max(required, max_rows))

@@ -78,7 +78,10 @@ MESSAGES = {
 
 
 def find_untrained(run: Run) -> Finding | None:
-    """Find out why the policy of a run has not been updated. Return None if it has been, or before the first evaluation."""
+    """Find out why the policy of a run has not been updated, or never will be.
+
+    Return None if it has been, and before the first evaluation of a run whose steps are not all random.
+    """
     settings, lines = run.config.settings, run.metrics()
     if (reason := warmup_warning(settings)) is not None:
         return Finding("all steps random", {"reason": reason})

@@ -222,9 +222,13 @@ def make_host_collector(
 ) -> HostCollector:
     """Make a collector with a task's environments. If a seed has several, they step in worker processes."""
     n_seeds = len(seeds)
-    envs = make_vec_env(task, n_seeds * config.n_envs, parallel=config.n_envs > 1)
-    evaluation_envs = make_vec_env(task.evaluation_task, n_seeds * n_open_envs(task, n_seeds, n_evaluation_episodes))
-    return HostCollector(envs, evaluation_envs, config, seeds)
+    with contextlib.ExitStack() as opened:
+        envs = opened.enter_context(make_vec_env(task, n_seeds * config.n_envs, parallel=config.n_envs > 1))
+        n_evaluation_envs = n_seeds * n_open_envs(task, n_seeds, n_evaluation_episodes)
+        evaluation_envs = opened.enter_context(make_vec_env(task.evaluation_task, n_evaluation_envs))
+        collector = HostCollector(envs, evaluation_envs, config, seeds)
+        opened.pop_all()  # from here on, the collector closes them
+    return collector
 
 
 def _write_timestep(columns: Timestep, t: int, timestep: Timestep) -> None:

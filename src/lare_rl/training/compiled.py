@@ -58,8 +58,8 @@ class CompiledFunctions(NamedTuple):
     fit: Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, Metrics]]
     """Make the decoders' own gradient updates. Return the mean of each metric."""
     train_step: Callable[..., tuple[Learner, Metrics]]
-    """Update the algorithm. The arguments are the learner, the newest steps (which are stored), keys, and the number of environment
-    steps before them. Return the mean of each metric."""
+    """Update the algorithm, and decoders that are updated with it. The arguments are the learner, the newest steps (which are stored),
+    keys, and the number of environment steps before them. Return the mean of each metric."""
     assess: Callable[[Learner], Metrics]
     """Compare proxy rewards with true rewards."""
 
@@ -156,10 +156,6 @@ def _free_memory() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-IsMeasured = dict[str, Bool[Array, " seeds"]]
-"""For which seeds a metric has been measured, by its name."""
-
-
 class LoopState(NamedTuple):
     """What a compiled iteration changes. The first axis of an array is the seed."""
 
@@ -167,8 +163,8 @@ class LoopState(NamedTuple):
     envs: VecEnvState
     metrics: Metrics
     """The metrics of the newest updates."""
-    is_measured: IsMeasured
-    """Whether they have been measured, in this call or before."""
+    is_measured: dict[str, Bool[Array, " seeds"]]
+    """For which seeds each of them has been measured, in this call or before."""
     steps: Trajectory
     """The newest steps, for the message about a factor that is not finite."""
     is_finite: Bool[Array, " seeds"]

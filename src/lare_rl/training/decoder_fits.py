@@ -21,7 +21,7 @@ from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.prequential import empty_predictions, squared_errors
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.data import replay
-from lare_rl.data.replay import Index, Replay
+from lare_rl.data.replay import Replay
 from lare_rl.data.sampling import CreditSample, sample_episode_steps, sample_packed, sample_padded
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.masks import select
@@ -200,14 +200,12 @@ def _held_out_error(
     decoders: Decoders, buffer: Replay, n_hidden: Int[Array, " envs"], config: CreditConfig
 ) -> Float[Array, ""]:
     """Return the squared error of the returns of held-out episodes, summed over the teams, each in units of its returns."""
-    empty = empty_predictions(1, config.credit_specs[0].window)
-    decoders = tuple(decoder._replace(predictions=empty) for decoder in decoders)
-    buffer = replay.segments_as_episodes(buffer)
-
-    def predict(decoder: DecoderState, episodes: CreditBatch, first: Index) -> DecoderState:
-        return learning.predict(decoder, episodes, config.credit_specs[0])
-
-    decoders = fold_episodes(decoders, buffer, buffer.current_episode - n_hidden, predict, config)
+    spec = config.credit_specs[0]
+    decoders = tuple(decoder._replace(predictions=empty_predictions(1, spec.window)) for decoder in decoders)
+    since = replay.segments_as_episodes(buffer).current_episode - n_hidden
+    decoders = fold_episodes(
+        decoders, buffer, since, lambda decoder, episodes, _: learning.predict(decoder, episodes, spec), config
+    )
     errors = [
         squared_errors(decoder.predictions)[0] / root_mean_square(decoder.return_scale) ** 2 for decoder in decoders
     ]

@@ -42,8 +42,6 @@ __all__ = [
 
 MAX_COMPILED_OPERATIONS, MAX_COMPILED_DEPTH = 400, 200
 """Graphs with more operations, or with a longer chain of them, are computed by NumPy: XLA would compile for too long."""
-FAILED_BATCH = "failed_batch.npz"
-"""The file in the run's directory with the inputs of a factor that is not finite."""
 
 
 def is_compilable(graph: Graph) -> bool:
@@ -92,8 +90,8 @@ def compute_host_factors(run: Run, config: CreditConfig, steps: Trajectory) -> F
         try:
             columns = function.step_factors(before, action, after, run.scored_observation)
         except NonFiniteFactorError as error:
-            path, batch = run.directory / FAILED_BATCH, {"observation": error.observation, "action": error.action}
-            replace_npz(path, batch)
+            path = run.directory / "failed_batch.npz"
+            replace_npz(path, {"observation": error.observation, "action": error.action})
             raise LareError(f"{error}; it was given the batch in {path}; the last checkpoint is whole") from error
         factors[..., config.team_slice(i), : columns.shape[-1]] = columns
     return factors

@@ -145,11 +145,9 @@ def fold_episodes(
 def _predict_then_update(
     decoders: Decoders, buffer: Replay, since: Int[Array, " envs"], config: CreditConfig
 ) -> Decoders:
-    def body(decoder: DecoderState, episodes: CreditBatch, first: Index) -> DecoderState:
-        return learning.predict_then_update(decoder, episodes, config.credit_specs[0])
-
+    update = partial(learning.predict_then_update, spec=config.credit_specs[0])
     expected = config.iteration_steps // config.longest_segment
-    return fold_episodes(decoders, buffer, since, body, config, expected)
+    return fold_episodes(decoders, buffer, since, lambda state, batch, _: update(state, batch), config, expected)
 
 
 def _rebuild_sums(

@@ -50,7 +50,7 @@ def explanation_source(run: Run) -> str:
     """Return which seed an explanation is of, and by which fit. Empty for the only seed and its decoder."""
     method = METHODS.find(run.config.settings.method)
     remarks = [f"of seed {run.seeds[0]} alone"] if len(run.seeds) > 1 else []
-    if method is not METHODS[_explaining_method(method)]:
+    if method is not _explaining_method(method):
         remarks.append(f"by a closed-form fit to the stored returns, which is not the decoder of {method.name}")
     text = ", ".join(remarks)
     return text[:1].upper() + text[1:]
@@ -75,10 +75,9 @@ def _find_explanations(run: Run, learner: Learner, config: TrainConfig) -> list[
         factor_names = run.functions[i].factor_columns(run.scored_observation) if run.functions else []
         raw_names = [] if config.team_level else fitted_specs[i].raw_feature_names(role.observation, role.action)
         decoder = select_seed(first_shard(learner.decoders[i]))
-        names, paid_once = range(spec.n_levels), run.config.task.payment_rule.only_at_end
-        findings.append(
-            returns_findings(explanation, decoder, spec, factor_names, raw_names, names, only_at_end=paid_once)
-        )
+        names = factor_names, raw_names, range(spec.n_levels)
+        only_at_end = run.config.task.payment_rule.only_at_end
+        findings.append(returns_findings(explanation, decoder, spec, *names, only_at_end=only_at_end))
     return findings
 
 
@@ -112,8 +111,8 @@ def _can_explain(config: TrainConfig) -> bool:
     return config.method.fit is not None and has_features
 
 
-def _explaining_method(method: Method) -> str:
-    return "lare-bayes" if method.needs_phi else "bayes"
+def _explaining_method(method: Method) -> Method:
+    return METHODS["lare-bayes" if method.needs_phi else "bayes"]
 
 
 def _explanation_config(config: TrainConfig) -> TrainConfig:
@@ -121,7 +120,7 @@ def _explanation_config(config: TrainConfig) -> TrainConfig:
     observed = "state" if config.team_level else "observation"
     has_raw_features = {observed, "action"} <= set(config.columns)
     if has_raw_features:
-        method = METHODS[_explaining_method(config.method)]
+        method = _explaining_method(config.method)
     elif config.method.needs_phi:
         method = replace(METHODS["lare-linear"], decoder="additive")
     else:

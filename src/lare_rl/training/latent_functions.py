@@ -41,13 +41,13 @@ def choose_functions(
     else:
         if (settings.draw, settings.candidates) != (0, N_CANDIDATES):
             raise LareError("draw and candidates choose a recorded function, and a function is given: leave either out")
-        if not isinstance(function, FunctionOrPath | Sequence):
+        chosen = [function] if isinstance(function, FunctionOrPath) else function
+        if not isinstance(chosen, Sequence) or not all(isinstance(choice, FunctionOrPath) for choice in chosen):
             raise LareError(
                 "a latent function must be the path of its file, or come from lare_rl.design or lare_rl.load_function, and is "
                 f"{short_repr(function)}: write its source to a file, which is verified"
             )
-        pairs = pair_with_roles([function] if isinstance(function, FunctionOrPath) else function, task)
-        functions = [_load_function(function, role) for function, role in pairs]
+        functions = [_load_function(choice, role) for choice, role in pair_with_roles(chosen, task)]
     for function in functions:
         check_phi(method, function, settings.choose_scored_observation(task))
     return tuple(functions)

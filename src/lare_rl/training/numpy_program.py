@@ -56,14 +56,16 @@ def to_numpy(
     Raises:
         UnsupportedOperationError: the function has an operation that is not translated.
     """
-    arguments, registers, calls, results, structure = _trace(
-        function, (fixed, *shapes), array_functions or _numpy_function
-    )
+    closed, result_shape = jax.make_jaxpr(function, return_shape=True)(fixed, *shapes)
+    translator = _Translator(array_functions or _numpy_function, [], [])
+    arguments = [translator.new_register() for _ in closed.jaxpr.invars]
+    results = translator.translate(closed, arguments)
     n_fixed, expected = len(jax.tree.leaves(fixed)), jax.tree.structure(shapes)
-    once, each_time = _split_calls(calls, arguments[n_fixed:])
+    structure = jax.tree.structure(result_shape)
+    once, each_time = _split_calls(_remove_unused(translator.calls, results), arguments[n_fixed:])
 
     def bind(fixed: Any) -> Callable[..., Any]:
-        bound = registers.copy()
+        bound = translator.registers.copy()
         bound[:n_fixed] = jax.tree.leaves(fixed)
         _run(once, bound)
 
@@ -81,27 +83,10 @@ def to_numpy(
     return bind
 
 
-def _trace(
-    function: Callable[..., Any], shapes: tuple[Any, ...], array_functions: ArrayFunctions
-) -> tuple[list[int], list[Any], list[_Call], list[int], Any]:
-    """Return the registers of the arguments, all registers, the calls, the registers of the results, and their structure."""
-    closed, result_shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
-    registers: list[Any] = []
-    calls: list[_Call] = []
-    arguments = [_new_register(registers) for _ in closed.jaxpr.invars]
-    results = _Translator(array_functions, registers, calls).translate(closed, arguments)
-    return arguments, registers, _remove_unused(calls, results), results, jax.tree.structure(result_shape)
-
-
 def _run(calls: Sequence[_Call], values: list[Any]) -> None:
     with np.errstate(all="ignore"):
         for operation, inputs, result in calls:
             values[result] = operation(*[values[i] for i in inputs])
-
-
-def _new_register(registers: list[Any], value: Any = None) -> int:
-    registers.append(value)
-    return len(registers) - 1
 
 
 class _Translator(NamedTuple):
@@ -111,15 +96,19 @@ class _Translator(NamedTuple):
     registers: list[Any]
     calls: list[_Call]
 
+    def new_register(self, value: Any = None) -> int:
+        self.registers.append(value)
+        return len(self.registers) - 1
+
     def translate(self, closed: ClosedJaxpr, arguments: Sequence[int]) -> list[int]:
         """Append the calls of a program. Return the registers of its results."""
         jaxpr: Jaxpr = closed.jaxpr
-        constants = [_new_register(self.registers, np.asarray(value)) for value in closed.consts]
+        constants = [self.new_register(np.asarray(value)) for value in closed.consts]
         register_of = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
 
         def find(atom: Any) -> int:
             if isinstance(atom, Literal):
-                return _new_register(self.registers, np.asarray(atom.val, _aval(atom).dtype))
+                return self.new_register(np.asarray(atom.val, _aval(atom).dtype))
             return register_of[atom]
 
         for equation in jaxpr.eqns:
@@ -128,7 +117,7 @@ class _Translator(NamedTuple):
             if equation.primitive.name == "concatenate":
                 inputs = [i for i, atom in zip(inputs, equation.invars, strict=True) if math.prod(_aval(atom).shape)]
             if not any(math.prod(result.shape) for result in results):  # another library may have no empty arrays
-                outputs = [_new_register(self.registers, np.zeros(result.shape, result.dtype)) for result in results]
+                outputs = [self.new_register(np.zeros(result.shape, result.dtype)) for result in results]
             elif equation.primitive.name == "dot_general":
                 outputs = [self._append_product(equation, inputs)]
             elif equation.primitive.name in INLINED:
@@ -143,7 +132,7 @@ class _Translator(NamedTuple):
         return [find(atom) for atom in jaxpr.outvars]
 
     def _append(self, operation: Operation, *arguments: int) -> int:
-        result = _new_register(self.registers)
+        result = self.new_register()
         self.calls.append(_Call(operation, arguments, result))
         return result
 

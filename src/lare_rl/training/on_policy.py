@@ -3,9 +3,8 @@
 Algorithm 1 of the LaRe paper, lines 6 to 8, for PPO and IPPO. The decoder has been fitted before, to stored episodes.
 """
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar, Shaped
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Scalar, Shaped
 
 from lare_rl.algorithms.batches import Metrics, Rollout
 from lare_rl.config.train_config import TrainConfig
@@ -24,7 +23,7 @@ def train_step(
 ) -> tuple[Learner, Metrics]:
     """Update the policy on `steps`, which have just been stored. Before them, each seed had made `env_steps` environment steps."""
     remaining = 1 - env_steps / config.steps
-    rollout = _rollout(learner, jax.tree.map(jnp.asarray, steps), config)
+    rollout = _rollout(learner, steps, config)
     state, metrics = config.algorithm.load().update(learner.algorithm, rollout, key, remaining, config.hyperparameters)
     return learner._replace(algorithm=state), metrics
 
@@ -43,15 +42,15 @@ def _rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> Rollou
     reward = rewards(stored, learner.decoders, config)  # [envs time agents]
     n_agents, agents_leave = config.env.n_agents, config.env.agents_leave
 
-    def for_each_agent(values: Array) -> Float[Array, "time envs agents"]:
+    def for_each_agent(values: Bool[Array, "time envs"]) -> Float[Array, "time envs agents"]:
         return jnp.broadcast_to(values[..., None], (*values.shape, n_agents)).astype(jnp.float32)
 
     # With gamma = 1, a time limit counts as an end: the critic learns the return up to it.
     gamma = getattr(config.hyperparameters, "gamma", 1)
-    terminated = for_each_agent(jnp.asarray(steps.next_timestep.terminated if gamma < 1 else steps.ended))
-    done = for_each_agent(jnp.asarray(steps.ended))
+    terminated = for_each_agent(steps.next_timestep.terminated if gamma < 1 else steps.ended)
+    done = for_each_agent(steps.ended)
     if agents_leave:
-        has_left = ~jnp.asarray(steps.next_timestep.alive)
+        has_left = ~steps.next_timestep.alive
         terminated, done = jnp.maximum(terminated, has_left), jnp.maximum(done, has_left)
 
     def merge_actors(rows: Shaped[Array, "time envs agents *rest"]) -> Shaped[Array, "time actors *rest"]:
@@ -65,5 +64,5 @@ def _rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> Rollou
         terminated=merge_actors(terminated),
         done=merge_actors(done),
         available=merge_actors(steps.timestep.available) if config.env.masks_actions else None,
-        mask=merge_actors(jnp.asarray(steps.timestep.alive).astype(jnp.float32)) if agents_leave else None,
+        mask=merge_actors(steps.timestep.alive.astype(jnp.float32)) if agents_leave else None,
     )

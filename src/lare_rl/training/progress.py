@@ -35,7 +35,10 @@ class Listener(Protocol):
         """Training begins at `step` (above 0 if a run is resumed), and will end at `steps`."""
 
     def on_step(self, step: int) -> None:
-        """Steps have been made: after an iteration and its updates, and once a second while a long one collects on the host."""
+        """Steps have been made: after an iteration and its updates, and once a second while environments step on the host.
+
+        During an evaluation, `step` does not grow.
+        """
 
     def on_evaluation(self, metrics: MetricLines) -> None:
         """An evaluation has been made. Its lines of metrics.jsonl have been written; the checkpoint may still be being written."""

@@ -108,7 +108,7 @@ def pure_credit(
         action_size: the length of a continuous action, or the number of discrete actions.
         n_envs: the number of environments.
         n_steps: the steps of each environment that `observe` stores at a time.
-        max_steps: the number of steps of the longest episode. From longer ones nothing is learned, or wrong steps.
+        max_steps: the number of steps of the longest episode. From a longer one, nothing or something wrong is learned.
         discrete: whether actions are discrete.
         agents: the number of agents of a team, which shares its return.
         low: the lower bounds of continuous actions in the environment's units, which `phi` reads.
@@ -242,7 +242,7 @@ def _trajectory(steps: CreditSteps, config: CreditConfig) -> Trajectory:
 
     def read(name: str, *rest: int) -> Float[Array, "time envs agents *rest"]:
         values, shape = jnp.asarray(getattr(steps, name), jnp.float32), (*lead, env.n_agents, *rest)
-        if values.size != math.prod(shape):
+        if values.shape[: len(lead)] != lead or values.size != math.prod(shape):
             raise LareError(f"{name} has the shape {values.shape}, and should have {shape}")
         return values.reshape(shape)
 

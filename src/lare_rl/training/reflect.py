@@ -59,7 +59,7 @@ def reflect(
         task: the task of the function: a name, a path, or a spec.
         model: the language model, as for `lare_rl.design`.
         episodes: whole episodes, or a run or its directory, whose stored episodes are used; by default, 40 are played.
-        policy: plays the episodes instead of random actions: a function from an observation of a single agent (and the mask of
+        policy: plays the episodes of a single agent instead of random actions: a function from an observation (and the mask of
             available actions, if the environment has one) to an action.
         record: a file to record every exchange in; if the design was recorded, the same file.
 

@@ -22,7 +22,7 @@ from lare_rl.training.decoder_inputs import alive_agents, step_batch
 from lare_rl.training.learner import Learner
 from lare_rl.util.statistics import FLOAT32_NOISE
 
-__all__ = ["accuracy_metrics", "assess", "masked_correlation", "mean_absolute_error", "rewards", "team_metrics"]
+__all__ = ["assess", "has_step_rewards", "masked_correlation", "mean_absolute_error", "rewards", "team_metrics"]
 
 
 def rewards(

@@ -142,7 +142,7 @@ def _batch_lengths(config: TrainConfig) -> list[int]:
 def _observe_states(statistics: RunningMeanStd, steps: Trajectory, config: TrainConfig) -> RunningMeanStd:
     """Update the running statistics of the mixer's input by new steps."""
     timestep = steps.next_timestep
-    rows = jnp.asarray(_mixer_input(timestep.observation, timestep.state, config))
+    rows = _mixer_input(timestep.observation, timestep.state, config)
     return update_mean_std(statistics, rows.reshape(-1, rows.shape[-1]))
 
 

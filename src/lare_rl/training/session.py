@@ -79,7 +79,7 @@ class Session:
     other."""
 
     _unchecked: tuple[Any, Trajectory] | None = None
-    """The newest steps, after whether all their factors are finite, for each seed."""
+    """Whether all factors of the newest steps are finite, for each seed; and these steps."""
     _threads: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(3))
     """Threads that write checkpoints, update while steps are collected, and compile."""
     _saving: Future[None] | None = None
@@ -147,7 +147,7 @@ class Session:
         self.learner, self.collector.envs = state.learner, state.envs
         self._unchecked = is_finite, state.steps
         self._check_factors()
-        self.latest_metrics |= {name: state.metrics[name] for name, seeds in is_measured.items() if seeds.any()}
+        self.latest_metrics |= {name: state.metrics[name] for name, by_seed in is_measured.items() if by_seed.any()}
         self.step += n_iterations * self.config.iteration_steps
 
     def _store(self, steps: Trajectory) -> None:
@@ -229,10 +229,8 @@ class Session:
         # Only at the end, because it takes as long as the evaluation of sampled actions. Not in JAX, where another program would have to be
         # compiled.
         if is_last and is_sampled and isinstance(self.collector, HostCollector):
-            deterministic = self.collector.evaluate(actor, n_episodes, deterministic=True)
-            means = deterministic.returns.mean(axis=1)
-            teams = self.config.env.teams
-            metrics |= team_metrics([{DETERMINISTIC_RETURN: means[:, i]} for i in range(len(teams))], teams)
+            means = self.collector.evaluate(actor, n_episodes, deterministic=True).returns.mean(axis=1)
+            metrics |= team_metrics([{DETERMINISTIC_RETURN: mean} for mean in means.T], self.config.env.teams)
         if self.step > self.settings.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
             metrics[ACTOR_SATURATION] = saturation(greedy_actions(actor, self.learner.replay, self.config))
         check_losses(self.latest_metrics, self.run.seeds, self.step)

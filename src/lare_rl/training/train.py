@@ -197,11 +197,12 @@ def _introduction(session: Session, earlier_steps: int) -> list[str]:
             f"and falls again from {1 - step / settings.steps:.0%}, so the result is not that of one long run; a run that began with "
             f"--{settings.algorithm}.no-anneal can be extended"
         )
-    warning = warmup_warning(settings)
-    if warning is None and step < settings.warmup:
-        warning = f"the first {settings.warmup:,} steps are random ({settings.algorithm}.warmup): the policy is not trained yet"
-    if warning is not None:
+    if (warning := warmup_warning(settings)) is not None:
         messages.append(warning)
+    elif step < settings.warmup:
+        messages.append(
+            f"the first {settings.warmup:,} steps are random ({settings.algorithm}.warmup): the policy is not trained yet"
+        )
     if step >= settings.steps:
         messages.append(
             f"the run is complete ({settings.steps:,} steps): to continue it, give a larger --steps (steps=... in Python)"

@@ -112,7 +112,7 @@ def evaluate_batch_on_host(
                 values[ended] = next_timestep.measures[name][ended]
     except EnvOutputError as error:
         where = "" if error.env_index is None else f", in an evaluation of seed {seeds[error.env_index // shape[1]]}"
-        raise EnvOutputError(f"{error}{where}") from None
+        raise EnvOutputError(f"{error}{where}") from error
     results = Evaluation(returns, summed_returns, lengths, measures)
     return jax.tree.map(lambda values: values[:, :n_episodes], results)
 
@@ -122,7 +122,7 @@ def evaluation_policy(
 ) -> BatchPolicy:
     """Return a policy of all seeds that has the actors' memory, for episodes that all begin with its first call.
 
-    Noise is drawn for `n_noise_rows` episodes of each seed. These episodes use the `noise_rows` of it.
+    Noise is drawn for `n_noise_rows` episodes of each seed. These episodes use the rows `noise_rows` of it.
     """
     deterministic, n_episodes = config.deterministic_evaluation, len(noise_rows)
     policy = make_host_policy(config, actor, n_episodes, deterministic=deterministic)

@@ -27,8 +27,6 @@ __all__ = ["QMIX", "Memory", "act", "epsilon", "get_actor", "init", "init_memory
 
 Observations = Float[Array, "*batch agents observation"]
 Actions = Float[Array, "*batch agents action"]
-ActionValues = Float[Array, "*batch agents action"]
-"""Q_i(h_t, .): the value of each choice of an agent."""
 AvailableActions = Bool[Array, "*batch agents action"]
 Steps = Float[Array, "episodes steps"]
 
@@ -91,7 +89,7 @@ def agent_input(observation: Observations, last_action: Actions) -> Float[Array,
     return jnp.concatenate([observation, last_action, agent_id], axis=-1)
 
 
-def greedy_action(value: ActionValues, available: AvailableActions) -> Actions:
+def greedy_action(value: Float[Array, "*batch agents action"], available: AvailableActions) -> Actions:
     """Return the available action of largest value; the first action if none is available, as in the padding of an episode."""
     return jax.nn.one_hot(jnp.argmax(jnp.where(available, value, -jnp.inf), axis=-1), value.shape[-1])
 
