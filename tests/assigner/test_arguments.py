@@ -7,6 +7,7 @@ from gymnasium import spaces
 
 from helpers.assigner_episodes import small_assigner
 from lare_rl.assigner.arguments import read_steps, to_levels, to_rows, to_score, to_step_ids
+from lare_rl.assigner.group_names import to_group_name
 from lare_rl.errors import LareError
 
 
@@ -66,6 +67,12 @@ def test_arguments_are_refused(call, message):
 
 def test_score_may_have_axes():
     assert to_score(np.array([[2.0]]), "the score") == 2.0
+
+
+def test_group_may_be_an_array():
+    torch = pytest.importorskip("torch")
+    for value in (np.array([3]), jnp.array(3), torch.tensor(3)):
+        assert to_group_name(value) == 3
 
 
 def test_one_hot_rows_are_floats():

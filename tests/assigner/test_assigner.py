@@ -255,6 +255,7 @@ def test_step_with_an_infinite_factor_costs_only_the_episodes_that_wait(chase, t
     credit.add([[0.0, 0.0]], [[0.0]], [[0.0, 0.0]], [0.0], [False], [False])
     with pytest.raises(LareError, match=r"factor_1. is inf"):
         credit.rewards_at(bad)
+    assert credit.get_state(episodes=False).arrays["counts"][2] == credit.store.dropped == 2
     np.testing.assert_array_equal(credit.store.inputs[bad], 0)
     credit.add([[0.0, 0.0]], [[0.0]], [[0.0, 0.0]], [7.0], [True], [False])  # the rest of an episode that waited
     numbers = credit.add_episode(*(np.minimum(array, 0) for array in third))

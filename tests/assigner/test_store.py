@@ -17,20 +17,28 @@ NOT_ENDED = np.zeros(1, bool), np.zeros(1, int)
 @settings(max_examples=100, deadline=None)
 @given(MOVES, st.integers(5, 12))
 def test_store_matches_a_twin_that_stores_all_steps(moves, capacity):
-    store, n_steps, running, ended, dropped = Store(capacity, (1,)), 0, {}, [], 0
+    """An episode that goes on after all its steps were overwritten stays abandoned: its last steps are no whole episode."""
+    store, n_steps, running, ended, dropped, abandoned = Store(capacity, (1,)), 0, {}, [], 0, set()
     for move, env_id in moves:
         steps = running.get(env_id)
         if move == "add":
             idle = [name for name, numbers in running.items() if numbers[-1] < n_steps - capacity]
             running = {name: numbers for name, numbers in running.items() if name not in idle}
-            dropped += len(idle)
+            dropped += len(set(idle) - abandoned)
+            abandoned |= set(idle)
             (number,) = store.add(1)
             store.get_running(env_id, np.zeros(1, np.float32)).step_ids.append(int(number))
             running.setdefault(env_id, []).append(n_steps)
             n_steps += 1
         elif move == "drop":
             store.drop(env_id)
-            dropped += running.pop(env_id, None) is not None
+            dropped += running.pop(env_id, None) is not None and env_id not in abandoned
+            abandoned.discard(env_id)
+        elif steps is not None and env_id in abandoned:
+            with pytest.raises(LareError, match="was abandoned"):
+                store.end(env_id, 1.0)
+            del running[env_id]
+            abandoned.discard(env_id)
         elif steps is not None and steps[0] < n_steps - capacity:
             with pytest.raises(LareError, match="capacity larger"):
                 store.end(env_id, 1.0)

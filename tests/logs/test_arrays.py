@@ -24,20 +24,6 @@ def test_round_trip_keeps_other_arrays(folder, tmp_path):
         assert all(np.array_equal(old[key], new[key]) for key in old if key != "rewards")
 
 
-def test_score_instead_of_rewards(folder, tmp_path):
-    def scored():
-        for episode in logged_episodes(3):
-            score = episode.pop("rewards").sum()
-            del episode["terminations"], episode["truncations"]
-            yield episode | {"score": score}
-
-    out = write_rewards_plus_one(folder(scored()), tmp_path / "new")
-    for new, episode in zip(read_directory(out), open_log(out).episodes(), strict=True):
-        assert new["paid"][-1] == new["score"] == pytest.approx(new["paid"].sum())
-        np.testing.assert_array_equal(episode.reward, new["paid"])
-        assert episode.complete
-
-
 def test_flat_arrays_of_d4rl(tmp_path):
     episodes = list(logged_episodes(5))
     columns = [

@@ -7,7 +7,7 @@ import pytest
 
 from lare_rl import LareError
 from lare_rl.errors import install_command
-from lare_rl.logs.log import atomic_output
+from lare_rl.logs.log import atomic_output, check_output
 from lare_rl.logs.open_log import open_log
 
 
@@ -36,17 +36,21 @@ def test_failed_output_is_undone(tmp_path):
     (tmp_path / "log").write_text("old")
     with pytest.raises(LareError, match="log cannot be written"), atomic_output(tmp_path / "log", True):
         pass  # nothing is written
+    with pytest.raises(LareError, match="cannot be written: File name too long"):
+        check_output(tmp_path / ("long" * 100), True)
     assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
 
 
 def test_output_after_a_killed_process(tmp_path):
-    for name in (".log.1.new", ".log.2.old", ".other.1.new"):
+    new, old = f".log.{'1' * 32}.new", f".log.{'2' * 32}.old"
+    unrelated = [f".log.parquet{old[4:]}", f".other{new[4:]}"]  # another process may still need them
+    for name in (new, old, *unrelated):
         (tmp_path / name).mkdir()
-    (tmp_path / ".log.2.old" / "0.npz").write_text("the old data")
+    (tmp_path / old / "0.npz").write_text("the old data")
     with pytest.raises(LareError, match="log exists"), atomic_output(tmp_path / "log", False):
         pass
     assert (tmp_path / "log" / "0.npz").read_text() == "the old data"
     with atomic_output(tmp_path / "log", True) as new:
         new.write_text("new")
     assert (tmp_path / "log").read_text() == "new"
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".other.1.new", "log"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [*unrelated, "log"]

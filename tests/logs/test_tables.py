@@ -109,14 +109,26 @@ def test_data_set_arrays_of_fixed_shape(tmp_path):
     check_log(open_log(tmp_path / "log"), logged_episodes(1))
 
 
-def test_whole_episodes_with_a_score_and_a_number(tmp_path):
-    episodes = list(logged_episodes(3))
-    rows = episode_rows(episodes).drop_columns("rewards")
-    rows = rows.append_column("score", pa.array([1.0, 2.0, 3.0])).append_column("episode", pa.array([0, 1, 2]))
-    write_parquet(rows, tmp_path / "log.parquet")
-    parsed = list(open_log(tmp_path / "log.parquet").episodes())
-    assert [len(episode) for episode in parsed] == [len(episode["actions"]) for episode in episodes]
-    assert [episode.reward.sum() for episode in parsed] == [1, 2, 3]
+@pytest.mark.parametrize(
+    ("ids", "size", "has_next", "lengths"),
+    [
+        ([0, 1, 2], 4, True, [4] * 3),  # rows are episodes
+        ([0, 1, 2], 4, False, [3] * 3),
+        ([0, 0, 1], 4, True, [2, 1]),  # steps, whose observations are pictures
+        ([0, 1, 2], 1, True, [1] * 3),
+    ],
+)
+def test_scores_and_numbers_of_episodes(tmp_path, ids, size, has_next, lengths):
+    observations = np.zeros((3, size, 2) if size > 1 else (3, 2)).tolist()
+    columns = {"episode": ids, "observations": observations, "score": [1.0, 1.0, 3.0]}
+    columns |= {"actions": np.zeros((3, size if has_next else size - 1)).tolist()}
+    columns |= {"next_observations": observations} if has_next else {}
+    pq.write_table(pa.table(columns), tmp_path / "log.parquet")
+    out = write_rewards_plus_one(tmp_path / "log.parquet", tmp_path / "new.parquet")
+    for path in (tmp_path / "log.parquet", out):
+        episodes = list(open_log(path).episodes())
+        assert [len(episode) for episode in episodes] == lengths
+        assert [episode.reward.sum() for episode in episodes][-2:] == [1, 3]
 
 
 def test_data_set_with_splits(tmp_path):

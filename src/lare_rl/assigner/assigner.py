@@ -145,7 +145,7 @@ class CreditAssigner:
     ) -> Int[np.ndarray, " steps"]:
         """Add one step of each of several environments.
 
-        An environment without a step while `capacity` steps of others came is abandoned, as by `drop`.
+        If an environment has no step while `capacity` steps of others come, its episode is abandoned: nothing is learned from it.
 
         Args:
             observation: the observations before the steps: (n, ...), for many agents (n, agents, ...). If `phi` was designed for the
@@ -159,15 +159,16 @@ class CreditAssigner:
             env_ids: the environment of each row, as any hashable value; 0 to n - 1 by default.
             valid: (n,), false for a row that is not a step, such as the call after an end in which a vector environment resets.
             alive: (n, agents), which agents acted; all by default.
-            group: the group of each row's episode, as a text or a number, if the assigner has groups. At most 64 may differ. It may be
-                None at a step after which nothing is paid.
+            group: the group of each row's episode, as a text or a number, if the assigner has groups. At most 64 may differ. If the
+                environment pays only at the end, it may be None before the last step.
             lanes: the earlier name of `env_ids`.
 
         Returns:
             A number for each step, for `rewards_at`; -1 for a row that is not valid.
 
         Raises:
-            LareError: shapes do not fit, a number is not finite or too large, or the steps or an episode are more than `capacity`.
+            LareError: shapes do not fit, a number or a factor of `phi` is not finite, a number is too large, or the steps or an
+                episode are more than `capacity`.
         """
         with self.lock:
             if env_ids is not None and lanes is not None:
@@ -250,10 +251,11 @@ class CreditAssigner:
     def rewards_at(self, steps: Any) -> Float[np.ndarray, "*shape"]:
         """Return r_hat of stored steps by the newest decoder: an array of the shape of `steps`, for many agents with one more axis.
 
-        It is 0 for the number -1, and for all steps while nothing has been fitted. `ircr` pays 0.5 until an episode ends.
+        It is 0 for the number -1 and, if the method has a decoder, for all steps before its first fit. `ircr` pays 0.5 until an
+        episode ends.
 
         Raises:
-            LareError: a step was never stored, or is not stored any more.
+            LareError: a step was never stored, or is not stored any more; or a factor of `phi` is not finite.
         """
         with self.lock:
             self.learner.learn_if_due()

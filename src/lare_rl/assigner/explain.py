@@ -22,17 +22,16 @@ __all__ = ["describe_returns", "explain"]
 def describe_returns(learner: DecoderLearner, group_names: Iterable[Hashable]) -> list[str]:
     """Return the explanation in sentences: none for too few episodes, and for a method without a decoder."""
     learner.learn_returns()
-    explanation, decoder, config = explain(learner), learner.decoder, learner.config
+    explanation, config = explain(learner), learner.config
     if explanation is None:
         return []
     factor_names = [] if config.phi is None else config.phi.factor_columns(config.scored_observation)
-    raw_names = config.raw_feature_names
     findings = returns_findings(
         explanation,
-        decoder,
+        learner.decoder,
         config.spec,
         factor_names,
-        raw_names,
+        config.raw_feature_names,
         group_names,
         only_at_end=config.payments.only_at_end,
     )

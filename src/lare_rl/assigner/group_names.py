@@ -1,8 +1,7 @@
 """The names of groups of episodes, in arguments and in logs."""
 
+import contextlib
 from typing import Any
-
-import numpy as np
 
 from lare_rl.errors import LareError, short_repr
 
@@ -14,7 +13,9 @@ GroupName = str | int | float
 
 def to_group_name(value: Any, name: str = "a group") -> GroupName:
     """Return a text or a number as Python's own. Raises `LareError` for anything else, which `name` describes."""
-    group = value.item() if hasattr(value, "item") and np.size(value) == 1 else value  # of NumPy, JAX or PyTorch
+    group = value
+    with contextlib.suppress(AttributeError, TypeError, ValueError, RuntimeError):  # not a single number
+        group = value.item()  # of NumPy, JAX or PyTorch
     if not isinstance(group, GroupName) or group != group:  # NaN
         raise LareError(f"{name} must be a text or a number, and is {short_repr(value)}")
     return group

@@ -58,8 +58,8 @@ def get_state(learner: DecoderLearner, group_names: Iterable[GroupName], *, epis
     store = learner.store
     leaves = named_leaves((learner.decoder,))
     arrays = {LEARNED + name: np.asarray(leaf) for name, leaf in leaves.items()}
-    counts = store.n_ended, store.n_ended_steps, store.dropped + len(store.running), store.max_ended_steps
-    arrays["counts"] = np.array(counts)
+    n_lost = sum(not episode.is_abandoned for episode in store.running.values())  # running episodes are not saved
+    arrays["counts"] = np.array([store.n_ended, store.n_ended_steps, store.dropped + n_lost, store.max_ended_steps])
     for name, chunks in zip(PHI_SAMPLE, zip(*learner.phi_sample, strict=True), strict=False):
         arrays[name] = np.concatenate(chunks)
     if episodes:

@@ -10,7 +10,7 @@ import heapq
 import warnings
 from array import array
 from collections.abc import Hashable, Iterable, Iterator, MutableSequence, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -52,7 +52,7 @@ class RunningEpisode:
     last_observation: Float[np.ndarray, "*agents observation"] | None = None
     """The observation after its last step."""
     is_abandoned: bool = False
-    """Whether nothing is learned from it, because some of its steps have no inputs."""
+    """Whether nothing is learned from it, because some of its steps have no inputs, or are not stored."""
 
 
 _Step = tuple[RunningEpisode, int, float, bool]
@@ -110,6 +110,8 @@ class Store:
         """A heap of the stored episodes: first step, and number."""
         self.running: dict[Hashable, RunningEpisode] = {}
         """The running episodes by environment. The environment whose last step is the oldest comes first."""
+        self.idle: dict[Hashable, RunningEpisode] = {}
+        """Abandoned episodes, none of whose steps is stored, by environment. They may go on. There are at most `capacity`."""
         self.dropped = 0
         """Abandoned episodes and refused payments."""
         self.n_mismatches = 0
@@ -134,7 +136,7 @@ class Store:
     def add(self, n_steps: int, alive: Bool[np.ndarray, "n_steps agents"] | None = None) -> Int[np.ndarray, " n_steps"]:
         """Return numbers for new steps.
 
-        Ended episodes are removed once a step of them is overwritten, running ones once all are.
+        Ended episodes are removed once a step of them is overwritten. Running ones are abandoned once all are.
 
         Raises:
             LareError: there are more steps than can be stored.
@@ -142,7 +144,11 @@ class Store:
         if n_steps > self.capacity:
             raise LareError(f"{n_steps} steps at once are more than capacity = {self.capacity}: make capacity larger")
         while self.running and next(iter(self.running.values())).step_ids[-1] < self.oldest_step:
-            self.drop(next(iter(self.running)))
+            env_id, episode = next(iter(self.running.items()))
+            self.drop(env_id)
+            self.idle[env_id] = replace(episode, step_ids=array("q"), n_paid=0)
+        while len(self.idle) > self.capacity:
+            del self.idle[next(iter(self.idle))]
         step_ids = np.arange(self.n_added, self.n_added + n_steps)
         self.n_added += n_steps
         while self.oldest and self.oldest[0][0] < self.oldest_step:
@@ -214,6 +220,7 @@ class Store:
                 more, or all of its steps have been paid for.
         """
         if env_id not in self.running:
+            self.idle.pop(env_id, None)
             raise LareError(
                 f"no episode is running in the environment {env_id!r}: it has ended, or is older than "
                 f"{self.capacity} steps (capacity)"
@@ -224,7 +231,8 @@ class Store:
         episode = self.running.pop(env_id)
         if episode.is_abandoned:
             raise LareError(
-                f"the episode of the environment {env_id!r} was abandoned, because a factor of phi was not finite"
+                f"the episode of the environment {env_id!r} was abandoned: a factor of phi was not finite, or it had no step "
+                f"while {self.capacity} steps of others came (capacity)"
             )
         if len(episode.step_ids) == episode.n_paid:
             self.dropped += 1
@@ -284,6 +292,8 @@ class Store:
         If the last step led to a different observation, the environment was reset in between: the running episode is abandoned, and a
         new one begins.
         """
+        if env_id in self.idle:
+            self.running[env_id] = self.idle.pop(env_id)
         last = self.running[env_id].last_observation if env_id in self.running else None
         if last is not None and np.array_equal(last, observation):
             self.n_mismatches = 0
@@ -303,15 +313,19 @@ class Store:
 
     def drop(self, env_id: Hashable) -> None:
         """Abandon the running episode of an environment. Its steps stay stored, and are never learned from."""
-        episode = self.running.pop(env_id, None)
-        self.dropped += episode is not None and not episode.is_abandoned
+        for episodes in (self.running, self.idle):
+            if env_id in episodes:
+                self._abandon(episodes.pop(env_id))
+
+    def _abandon(self, episode: RunningEpisode) -> None:
+        self.dropped += not episode.is_abandoned
+        episode.is_abandoned = True
 
     def forget_since(self, step_id: int) -> None:
         """Abandon the episodes that have this step or later ones, with what follows."""
         for episode in self.running.values():
-            if episode.step_ids[-1] >= step_id and not episode.is_abandoned:
-                episode.is_abandoned = True
-                self.dropped += 1
+            if episode.step_ids[-1] >= step_id:
+                self._abandon(episode)
         n_before = len(self.episodes)
         self.episodes = {n: episode for n, episode in self.episodes.items() if episode.step_ids[-1] < step_id}
         self.dropped += n_before - len(self.episodes)

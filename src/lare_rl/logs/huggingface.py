@@ -18,16 +18,13 @@ from lare_rl.logs.tables import TableLog, batch_rows, write_tables
 
 __all__ = ["HuggingFaceLog"]
 
-STATE, SPLITS = "state.json", "dataset_dict.json"
-"""The file that marks a data set, and the file that marks a directory of several."""
-
 
 class HuggingFaceLog(TableLog):
     """A data set of one split."""
 
     def read_batches(self) -> Iterator[pa.RecordBatch]:
-        if (self.path / SPLITS).exists():
-            names = ", ".join(sorted(str(state.parent) for state in self.path.glob(f"*/{STATE}")))
+        if (self.path / "dataset_dict.json").exists():
+            names = ", ".join(sorted(str(state.parent) for state in self.path.glob("*/state.json")))
             raise LareError(f"{self.path} has several splits: name one of {names}")
         try:
             dataset: Any = datasets.Dataset.load_from_disk(str(self.path)).with_format("arrow")

@@ -12,7 +12,7 @@ from uuid import uuid4
 from lare_rl.errors import LareError
 from lare_rl.logs.episode import LoggedEpisode, LogLayout, RelabelledEpisode, infer_layout, parse_episode
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.util.files import check_writable
+from lare_rl.util.files import check_writable, report_write_error
 
 __all__ = ["Log", "atomic_output", "batch_by_steps", "check_output", "list_files"]
 
@@ -88,19 +88,18 @@ def check_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> No
 
     `folders` are the names of the directories that a log has. A directory with others is never replaced.
     """
-    if out.exists() and not overwrite:
-        raise LareError(f"{out} exists: choose another path, or replace it with --overwrite (overwrite=True)")
-    if out.is_dir():
-        foreign = [
-            path.name
-            for path in sorted(out.iterdir())
-            if (path.name not in folders if path.is_dir() else path.suffix not in LOG_SUFFIXES)
-        ]
-        if foreign:
-            raise LareError(f"{out} cannot be replaced, because {foreign[0]} in it is not a log: choose another path")
-    if not out.name or not out.parent.is_dir():
-        raise LareError(f"{out} cannot be written: there is no directory {out.parent}")
-    check_writable(out)
+    with report_write_error(out):
+        if out.exists() and not overwrite:
+            raise LareError(f"{out} exists: choose another path, or replace it with --overwrite (overwrite=True)")
+        for path in sorted(out.iterdir()) if out.is_dir() else []:
+            is_foreign = path.name not in folders if path.is_dir() else path.suffix not in LOG_SUFFIXES
+            if is_foreign:
+                raise LareError(
+                    f"{out} cannot be replaced, because {path.name} in it is not a log: choose another path"
+                )
+        if not out.name or not out.parent.is_dir():
+            raise LareError(f"{out} cannot be written: there is no directory {out.parent}")
+        check_writable(out)
 
 
 def list_files(directory: Path, suffix: str) -> list[Path]:
@@ -118,13 +117,12 @@ def atomic_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> I
     check_output(out, overwrite, folders)
     new, old = (out.with_name(f".{out.name}.{uuid4().hex}.{kind}") for kind in ("new", "old"))
     try:
-        yield new
-        check_output(out, overwrite, folders)
-        if out.is_dir() or (out.exists() and new.is_dir()):  # which nothing replaces at once
-            out.rename(old)
-        new.replace(out)
-    except OSError as error:
-        raise LareError(f"{out} cannot be written ({error.strerror or error}); existing data are unchanged") from error
+        with report_write_error(out, "; existing data are unchanged"):
+            yield new
+            check_output(out, overwrite, folders)
+            if out.is_dir() or (out.exists() and new.is_dir()):  # which nothing replaces at once
+                out.rename(old)
+            new.replace(out)
     finally:
         if old.exists() and not out.exists():
             old.rename(out)
@@ -135,7 +133,7 @@ def atomic_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> I
 def _clean_up(out: Path) -> None:
     """Put back the data that a killed process had moved away, and remove what it had written so far."""
     with contextlib.suppress(OSError):
-        for path in out.parent.glob(f".{glob.escape(out.name)}.*"):
+        for path in out.parent.glob(f".{glob.escape(out.name)}.{'[0-9a-f]' * 32}.*"):  # not of a longer name than `out`
             if path.suffix == ".old" and not out.exists():
                 path.rename(out)
             elif path.suffix in (".old", ".new"):

@@ -50,21 +50,27 @@ class TableLog(Log):
         first = next(batches, None)
         if first is None:
             return
-        _check_columns(self.path, first.schema)
+        names = first.schema.names
+        ids = first.column(names.index("episode")).to_pylist() if "episode" in names else ()
+        self.row_is_episode = _rows_are_episodes(first.schema, ids)
+        _check_columns(self.path, first.schema, self.row_is_episode)
         batches = itertools.chain([first], batches)
-        if _rows_are_episodes(first.schema):
+        if self.row_is_episode:
             rows = (batch.slice(row, 1) for batch in batches for row in range(len(batch)))
             tables = enumerate(pa.Table.from_batches([row]) for row in rows)
         else:
             tables = self._group_steps(batches)
         for episode, table in tables:
             name = f"{self.name}, episode {episode}"
-            yield name, _read_arrays(name, table), table
+            yield name, _read_arrays(name, table, self.row_is_episode), table
 
     def write(self, out: str | Path, episodes: Iterable[RelabelledEpisode], overwrite: bool, comment: str) -> Path:
         with atomic_output(Path(out), overwrite) as path:
             batches = batch_by_steps(episodes, lambda item: len(item.r_hat))
-            self.write_file(path, (pa.concat_tables([_replace_rewards(*item) for item in batch]) for batch in batches))
+            tables = (
+                pa.concat_tables([_replace_rewards(*item, self.row_is_episode) for item in batch]) for batch in batches
+            )
+            self.write_file(path, tables)
         return Path(out)
 
     def _group_steps(self, batches: Iterator[pa.RecordBatch]) -> Iterator[tuple[int | str, pa.Table]]:
@@ -128,11 +134,11 @@ def _split_episodes(name: str, batch: pa.RecordBatch) -> Iterator[tuple[int | st
         yield column[start].as_py(), batch.slice(start, end - start)
 
 
-def _check_columns(path: Path, schema: pa.Schema) -> None:
+def _check_columns(path: Path, schema: pa.Schema, row_is_episode: bool) -> None:
     """Check that no key has two columns, and that a table of steps has one column `episode` and one `next_observations`."""
     if key := next((key for key in KEYS if schema.names.count(key) > 1), None):
         raise LareError(f"{path} has {schema.names.count(key)} columns {key}: keep one")
-    if _rows_are_episodes(schema):
+    if row_is_episode:
         return
     for name, meaning in (("episode", "the episode of a step"), ("next_observations", "the observation after a step")):
         if schema.names.count(name) != 1:
@@ -151,15 +157,25 @@ def _first_difference(expected: pa.Schema, actual: pa.Schema) -> str:
     return next((new or old for old, new in columns if old != new), "a column")
 
 
-def _rows_are_episodes(schema: pa.Schema) -> bool:
+def _rows_are_episodes(schema: pa.Schema, ids: Iterable[Any] = ()) -> bool:
     """Return whether each row is a whole episode: `rewards` (or `actions`, if there are no rewards) is a list column.
 
-    Without rewards, the columns `episode` and `next_observations` say that rows are steps: the action of a step may be a list, too.
+    Without rewards, the columns `episode` and `next_observations` say that rows are steps, whose actions may be lists, too. But if
+    observations are lists of lists, they may be episodes: `ids`, the first values of `episode`, then decide. Steps share an id.
     """
-    types = dict(zip(schema.names, schema.types, strict=True))
-    if "rewards" in types:
-        return _is_list(types["rewards"])
-    return not {"episode", "next_observations"} <= types.keys() and _is_list(types.get("actions", pa.null()))
+    depth = {name: _list_depth(data_type) for name, data_type in zip(schema.names, schema.types, strict=True)}
+    if "rewards" in depth:
+        return depth["rewards"] > 0
+    may_be_steps = depth.get("observations", 0) < 2 or any(old == new for old, new in itertools.pairwise(ids))
+    if {"episode", "next_observations"} <= depth.keys() and may_be_steps:
+        return False
+    return depth.get("actions", 0) > 0
+
+
+def _list_depth(data_type: pa.DataType) -> int:
+    """Return how many lists are nested in each row of a column."""
+    data_type = getattr(data_type, "storage_type", data_type)  # of an array of fixed shape in a Hugging Face data set
+    return 1 + _list_depth(data_type.value_type) if _is_list(data_type) else 0
 
 
 def _is_text(data_type: pa.DataType) -> bool:
@@ -171,10 +187,10 @@ def _is_list(data_type: pa.DataType) -> bool:
     return any(test(data_type) for test in tests)
 
 
-def _read_arrays(name: str, table: pa.Table) -> dict[str, np.ndarray]:
+def _read_arrays(name: str, table: pa.Table, row_is_episode: bool) -> dict[str, np.ndarray]:
     """Return the columns of an episode as arrays. If rows are steps, its score is that of the last step."""
     arrays = {key: _read_column(name, key, table.column(key)) for key in KEYS if key in table.column_names}
-    if _rows_are_episodes(table.schema):
+    if row_is_episode:
         return {key: array[0] for key, array in arrays.items()}
     if "score" in arrays:
         arrays["score"] = arrays["score"][-1]
@@ -207,10 +223,9 @@ def _read_column(name: str, key: str, column: pa.ChunkedArray) -> np.ndarray:
     return values.to_numpy(zero_copy_only=False).reshape(len(column), *shape)
 
 
-def _replace_rewards(episode: LoggedEpisode, r_hat: np.ndarray) -> pa.Table:
+def _replace_rewards(episode: LoggedEpisode, r_hat: np.ndarray, row_is_episode: bool) -> pa.Table:
     """Return the table of an episode with r_hat as rewards, and the original rewards as `paid`."""
     table = episode.contents
-    row_is_episode = _rows_are_episodes(table.schema)
     for name, values in (("rewards", r_hat.astype(np.float32)), ("paid", episode.reward)):
         column = pa.array([values] if row_is_episode else values)
         if name in table.column_names:
