@@ -40,9 +40,6 @@ T = TypeVar("T")
 Count = Annotated[int, Field(ge=1)]
 """The type of a field of a checked model: a whole number, 1 or more."""
 
-CLOSE_RATIO = 0.65
-"""A name is close enough to be suggested if difflib's ratio is at least this."""
-
 
 class LareError(Exception):
     """An error that the user can correct.
@@ -81,7 +78,7 @@ def did_you_mean(name: str, known_names: Iterable[str]) -> str:
     names = list(known_names)
     suffixed = [other for other in names if other.endswith(f".{name.lstrip('-')}")]
     containing = [other for other in names if len(name) > 2 and name.lower() in other.lower()]
-    close = suffixed[:1] or difflib.get_close_matches(name, names, 1, CLOSE_RATIO) or containing[:1]
+    close = suffixed[:1] or difflib.get_close_matches(name, names, n=1, cutoff=0.65) or containing[:1]
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 

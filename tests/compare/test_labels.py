@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from lare_rl.compare.collect import collect_results
-from lare_rl.compare.labels import find_differences, label_runs
+from lare_rl.compare.labels import find_differences, find_origin_differences, label_runs
 from lare_rl.compare.messages import to_text
 from lare_rl.runs.directory import Run, open_without_functions
 
@@ -95,6 +95,8 @@ def test_find_differences(make_run):
     assert find_differences(runs[1:]) == []
     (finding,) = collect_results([run.directory for run in runs[:2]])[1]
     assert "td3.warmup (10: dense; 20: rd)" in to_text([finding])
+    (origin,) = find_origin_differences([runs[0], change_run(runs[1], versions={})])
+    assert "unknown: rd" in str(origin)
 
 
 def test_find_function_differences(make_run):

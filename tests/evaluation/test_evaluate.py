@@ -90,11 +90,13 @@ def test_write_video(tmp_path, monkeypatch):
             check_video_path(tmp_path / name)
 
 
-def test_record_video(run, tmp_path):
-    """A GIF has at most 25 frames a second, so it shows every second step."""
+def test_record_video(run, tmp_path, monkeypatch):
+    """A GIF has at most 25 frames a second, so it shows every second step. Gymnasium accepts a rate of None."""
     record_video(run, tmp_path / "film.gif")
     with Image.open(tmp_path / "film.gif") as film:
         assert (film.n_frames, film.info["duration"]) == (10, 40)
+    monkeypatch.setitem(FilmedChase.metadata, "render_fps", None)
+    assert video.record_frames(run, max_frames=2)[1] == 2 / video.DEFAULT_FPS
     assert not FilmedChase.open_envs
 
 

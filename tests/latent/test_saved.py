@@ -86,6 +86,9 @@ def test_source_changed_by_hand(function, chase, path, with_record):
     assert loaded.model == "A model, draw 0; changed by hand since"
     assert loaded.exchanges == (function.exchanges if with_record else ())
     assert loaded.meanings[1] == "exertion"
+    loaded.save(path)
+    path.write_text(path.read_text().replace("# 2. exertion", "# 2. work"))
+    assert load_function(path, chase).model == loaded.model  # the note is there once
 
 
 @pytest.mark.parametrize(

@@ -11,15 +11,14 @@ import pytest
 from helpers.chat_servers import (
     Server,
     break_off,
-    compress,
-    drip_body,
     drip_headers,
-    flood,
+    endless_body,
     hang_up,
     raw_answer,
     refuse,
     reply_with,
     reset_connection,
+    send_bomb,
     text_completion,
     text_response,
 )
@@ -171,8 +170,8 @@ def test_reply_after_temporary_errors(start, answers, expected_pauses):
                 (308, "//127.0.0.2/v1"),
             )
         ),
-        (flood(200), 1, ["more than 8 MB"]),
-        (compress("gzip, gzip", 2), ATTEMPTS, ["gzip, gzip"]),
+        (endless_body(200, b" " * (1 << 20)), 1, ["more than 8 MB"]),
+        (send_bomb, ATTEMPTS, ["gzip, gzip"]),
     ],
 )
 def test_no_reply(start, answer, n_requests, words):
@@ -250,7 +249,7 @@ def hang(handler):
     threading.Event().wait(30)
 
 
-@pytest.mark.parametrize("answer", [drip_body(200), drip_body(500), drip_headers, hang])
+@pytest.mark.parametrize("answer", [*(endless_body(status, b" ", 0.05) for status in (200, 500)), drip_headers, hang])
 def test_slow_answer_ends_with_the_time_of_the_design(start, answer):
     messages = []
     server, model, _ = start(answer, budget=Budget(seconds=0.4), on_message=messages.append)

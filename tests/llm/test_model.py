@@ -36,3 +36,7 @@ def test_objects_with_a_name_are_used_as_they_are(monkeypatch):
     monkeypatch.setenv("OPENAI_API_KEY", "none")
     for model in (ScriptedModel(PHI), LiveModel("m", "http://127.0.0.1:1/v1")):
         assert as_model(model) is model
+    model = ScriptedModel(PHI)
+    model.name = None
+    with pytest.raises(LareError, match=r"name \(a text\)"):
+        as_model(model)

@@ -86,7 +86,7 @@ def test_learner_comes_back(method, payments, tmp_path):
     leaves, structure = jax.tree.flatten(shape)
     learner = jax.tree.unflatten(structure, [np.full(leaf.shape, n, leaf.dtype) for n, leaf in enumerate(leaves)])
     expected = checkpoint.named_leaves(learner)
-    checkpoint.write(tmp_path, checkpoint.take_snapshot(tmp_path, learner, {}, {}))
+    checkpoint.write(tmp_path, checkpoint.take_snapshot(tmp_path, learner, {"step": 0}, {}))
     jax.tree.map(np.testing.assert_array_equal, checkpoint.named_leaves(checkpoint.load(tmp_path, shape)[0]), expected)
     with np.load(tmp_path / "state.npz") as saved:
         arrays = {re.sub(r"(?<=\.)\w+", lambda m: OLD_NAMES.get(m[0], m[0]), name): saved[name] for name in saved.files}

@@ -57,7 +57,7 @@ def test_config_content(tmp_path, content, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"longest_episode": "many"}, "longest_episode = 'many'"),
+        ({"longest_episode": 0}, "longest_episode = 0"),
         ({"settings": {"seeds": 2_000_000_000}}, "seeds = 2000000000"),
         ({"versions": {"jax": {}}}, "versions.jax = {}"),
         ({"more": 1}, "'more'"),
@@ -146,6 +146,7 @@ def segments(**values) -> np.ndarray:
         ({"host": np.array(DEEP)}, TOO_DEEP),
         ({"host": np.array("[]")}, "not an object"),
         ({"host": np.zeros(3)}, "line 1 column 3"),
+        ({"host": np.array("{}")}, "'step'"),
         ({"host": host(step="3")}, "'3' is not a count"),
         ({"host": host(step=-1)}, "-1 is not a count"),
         ({"host": host(metrics_length=2**60)}, "is not a count"),

@@ -128,9 +128,17 @@ def test_only_the_most_frequent_features_are_used():
     assert "often" in table.names
 
 
+class Tensor:
+    """Several numbers, which PyTorch refuses to convert into one."""
+
+    def __float__(self):
+        raise RuntimeError("a Tensor with 2 elements cannot be converted to Scalar")
+
+
 OUTCOME = {"outcome": 1}
 BAD = [
     (3, ["rollout 0", "mapping", "3"]),
+    ({"outcome": Tensor()}, ["outcome", "Tensor"]),
     ({"outcome": "good"}, ["outcome", "'good'"]),
     ({"outcome": float("nan")}, ["outcome", "nan"]),
     ({"outcome": 1e300}, ["outcome", "1e+09"]),

@@ -20,7 +20,7 @@ IGNORED_SETTINGS = {"seed", "seeds", "draw", "steps", "evaluate_every", "evaluat
 
 ORIGINS: Mapping[str, Callable[[Config], str]] = {
     "version of LaRe": lambda config: config.lare,
-    "version of JAX": lambda config: config.versions["jax"],
+    "version of JAX": lambda config: config.versions.get("jax", "unknown"),
     "machine": lambda config: config.machine,
 }
 """Functions that return what has trained a run, by its name."""
@@ -58,8 +58,8 @@ def label_runs(runs: Sequence[Run]) -> dict[str, list[Run]]:
     def label(values: Mapping[str, Any]) -> str:
         method, algorithm = values["method"], values["algorithm"]
         names = [method, algorithm] if several_algorithms else [method]
-        settings = [f"{name} {values[name]}" for name in values if (name, method, algorithm) in distinguishing]
-        return ", ".join([*names, *settings])
+        names += [f"{name} {values[name]}" for name in values if (name, method, algorithm) in distinguishing]
+        return ", ".join(names)
 
     groups = group_pairs((label(values), run) for run, values in zip(runs, settings, strict=True))
     for split in (_split_by_function, _split_by_directory):

@@ -20,7 +20,7 @@ MESSAGES = {
     "untrained": "{run}: {reason}",
     "mean_over_agents": "Returns are means over the agents. --metric {metric} compares their sums.",
     "other_task": "{source} is left out: its task is {task}, and that of the runs {tasks}.",
-    "other_steps": "{source} has no {metric} of {label} at step {step:,} for every seed: no run of this task is compared there.",
+    "other_steps": "{source} lacks {metric} of {label} at step {step:,} for some seeds: no run of this task is compared there.",
     "differ": "The runs differ in {differences}.",
     "origin": "All runs: {facts}.",
     # Scores.

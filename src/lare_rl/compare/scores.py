@@ -72,45 +72,26 @@ def group_results(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_R
     curves = _index_curves(results, choice.metric)
     steps = _shared_steps(curves, choice)
     n_final = len(last_quarter(steps)) if choice.average_last_quarter else 1
-    groups = []
-    for label in dict.fromkeys(curve.label for curve in results):
-        group = [curve for curve in curves.values() if curve.label == label]
-        draws = tuple(sorted({curve.draw for curve in group}))
-        seeds = tuple(sorted({curve.seed for curve in group}))
-        scores = _fill_scores(label, draws, seeds, tasks[0], steps, curves)
-        groups.append(
-            LabelScores(
-                label=label,
-                task=tasks[0],
-                seeds=seeds,
-                draws=draws,
-                steps=tuple(steps),
-                scores=scores,
-                final_scores=scores[..., -n_final:].mean(axis=-1),
-            )
-        )
-    return groups
+    by_label = group_pairs((curve.label, curve) for curve in curves.values())
+    return [_stack_scores(label, tasks[0], group, steps, n_final) for label, group in by_label.items()]
 
 
-def _fill_scores(
-    label: str,
-    draws: Sequence[int],
-    seeds: Sequence[int],
-    task: str,
-    steps: Sequence[int],
-    curves: Mapping[_CurveKey, LearningCurve],
-) -> Float[np.ndarray, "draws seeds tasks steps"]:
-    """Return the scores of a label. Raises `LareError` if it lacks a draw or seed."""
+def _stack_scores(
+    label: str, task: str, curves: Sequence[LearningCurve], steps: Sequence[int], n_final: int
+) -> LabelScores:
+    """Return the scores of a label, whose final ones are of the last `n_final` steps. Raises `LareError` if it lacks a draw or seed."""
+    values = {(curve.draw, curve.seed): curve.values for curve in curves}
+    draws, seeds = (tuple(sorted(set(numbers))) for numbers in zip(*values, strict=True))
     scores = np.empty((len(draws), len(seeds), 1, len(steps)))
     for (i, draw), (j, seed) in product(enumerate(draws), enumerate(seeds)):
-        key = label, task, draw, seed
-        if key not in curves:
+        if (draw, seed) not in values:
             raise LareError(
                 f"{label} has no run on {task} with seed {seed} and draw {draw}, and needs the same seeds for every draw: train it, "
                 "or add it to the table"
             )
-        scores[i, j, 0] = [curves[key].values[step] for step in steps]
-    return scores
+        scores[i, j, 0] = [values[draw, seed][step] for step in steps]
+    final_scores = scores[..., -n_final:].mean(axis=-1)
+    return LabelScores(label, task, seeds, draws, tuple(steps), scores, final_scores)
 
 
 def last_quarter(steps: Sequence[int]) -> list[int]:

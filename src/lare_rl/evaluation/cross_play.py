@@ -36,7 +36,8 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
 
     The policies sample their actions. All matches have the same random numbers, and so the same initial states.
 
-    Raises `LareError` if the runs differ in task or algorithm, or the task has other than two teams or is not in JAX.
+    Raises `LareError` if the runs differ in task or algorithm, the task has other than two teams or is not in JAX, or a run has no
+    checkpoint.
     """
     episodes = check_count("episodes", episodes)
     task, other_task = (run.config.task for run in runs)

@@ -46,7 +46,7 @@ RANDOM_EPISODES = 10
 MAX_RANDOM_EPISODES = 50
 """The largest number of episodes with random actions that a report plays."""
 MIN_RANDOM_EPISODES = 5
-"""Fewer episodes have no useful standard deviation. They are only played if these take longer than `MAX_RANDOM_PLAY_S`."""
+"""Fewer episodes have no useful standard deviation. Fewer are played only if they take longer than `MAX_RANDOM_PLAY_S`."""
 RANDOM_PLAY_LIMIT_S = 5.0
 """Time after which no episode of random actions begins if there are `MIN_RANDOM_EPISODES`."""
 MAX_RANDOM_PLAY_S = 120.0

@@ -167,7 +167,7 @@ class TeamSample:
     factors: Float[np.ndarray, "rows factors"]
     reward: Float[np.ndarray, " rows"]
     """The true reward."""
-    has_step_rewards: bool = True
+    has_step_rewards: bool
     """Whether the true rewards of single steps are known: they are not if only steps with a payment have one."""
 
     @property

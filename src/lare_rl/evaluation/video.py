@@ -51,7 +51,7 @@ def record_video(run: Run, path: str | Path, best: bool = False, deterministic: 
 
     A film of a particle task shows each agent's credit, as number and colour.
 
-    Raises `LareError` if the environment cannot be drawn on this machine, or the file cannot be written.
+    Raises `LareError` if the run has no checkpoint, the environment cannot be drawn on this machine, or the file cannot be written.
     """
     path = Path(path)
     check_video_path(path)
@@ -155,7 +155,7 @@ def _record_on_host(run: Run, policy: RunPolicy, max_fps: float, max_frames: int
     task = run.config.task.evaluation_task
     with closing(make_host_env(task, render_mode="rgb_array", **camera)) as env:
         metadata = env.environment.metadata if isinstance(env, GymnasiumEnv) else {}
-        fps = metadata.get("render_fps", DEFAULT_FPS)
+        fps = metadata.get("render_fps") or DEFAULT_FPS
         interval = max(1, math.ceil(fps / max_fps))
         return _play_and_capture(run, env, policy, lambda: _render(env, run), interval, max_frames), interval / fps
 

@@ -204,8 +204,8 @@ def design(
 
     Raises:
         DesignError: no attempt passed, or an error or Ctrl-C came after the first reply.
-        LareError: there is no such kind, the model does not answer the first request, `record` exists, the environment does not run,
-            or each team of the task needs its own function.
+        LareError: there is no such kind or draw, `candidates` is not from 1 to 100, the model does not answer the first request, a text
+            of the task is not filled in, `record` exists, the environment does not run, or each team needs its own function.
     """
     task = require_role(resolve_task(task, playable=steps is None))
     check_kind(kind)

@@ -3,7 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, cast, get_args
+from typing import Any, NamedTuple, cast, get_args
 
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError, short_repr
@@ -81,11 +81,14 @@ def load_function(path: str | Path, task: TaskSpec | str | Path, steps: Steps | 
     function = verify_function(source, task, cast("FunctionKind", kind), steps, file)
     if file.suffix == ".json":
         return replace(function, model=_UNNAMED_LLM)
-    function = replace(function, model=header.get("model") or function.model)
-    function = _add_provenance(function, file.with_suffix(".json"))
-    if _was_changed(header, source) and not function.changed:
-        function = replace(function, model=function.model + CHANGED_SUFFIX)
-    return function
+    model, exchanges, saved_source = header.get("model") or function.model, (), function.source
+    json_file = file.with_suffix(".json")
+    if json_file.is_file():
+        model, exchanges, saved_source = _read_provenance(json_file)
+    is_changed = saved_source != function.source or _was_changed(header, source)
+    if is_changed and not model.endswith(CHANGED_SUFFIX):
+        model += CHANGED_SUFFIX
+    return replace(function, model=model, exchanges=exchanges)
 
 
 def _find_file(path: str | Path) -> Path:
@@ -123,18 +126,15 @@ def _was_changed(header: dict[str, str], source: str) -> bool:
     return header.get("sha256") not in (None, source_hash(source))
 
 
-def _add_provenance(function: LatentFunction, json_file: Path) -> LatentFunction:
-    """Add the model and the replies from the .json beside the source. The model's name says if the source was changed since."""
-    if not json_file.is_file():
-        return function
+def _read_provenance(json_file: Path) -> tuple[str, tuple[dict[str, Any], ...], object]:
+    """Return the model, the exchanges and the source in the .json beside a saved function."""
     try:
         saved = read_json(read_text(json_file))
         json.dumps(saved, ensure_ascii=False).encode()  # half of a surrogate pair can be read but not written
-        model = saved["model"] if saved["source"] == function.source else saved["model"] + CHANGED_SUFFIX
-        exchanges = tuple(Exchange(**exchange).model_dump() for exchange in saved["exchanges"])
-        if not isinstance(model, str):
+        if not isinstance(saved["model"], str):
             raise TypeError("model")
+        exchanges = tuple(Exchange(**exchange).model_dump() for exchange in saved["exchanges"])
+        return saved["model"], exchanges, saved["source"]
     except (LareError, ValueError, KeyError, TypeError) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else short_repr(error)
         raise LareError(f"{json_file} does not describe {json_file.with_suffix('.py').name}: {reason}") from error
-    return replace(function, model=model, exchanges=exchanges)

@@ -69,11 +69,12 @@ def ask(model: Model, messages: Sequence[Message], number: int = 0) -> str:
 def as_model(model: Any) -> Model:
     """Return a model, or the model that a function is. Raises `LareError` for anything else."""
     if isinstance(model, Model):
-        return model
-    if callable(model):
+        if isinstance(model.name, str):
+            return model
+    elif callable(model):
         return FunctionModel(cast(ModelFunction, model), getattr(model, "__name__", type(model).__name__))
     raise LareError(
-        "a model must be a function from messages to a text, or have a name and a method reply(messages, number), as "
+        "a model must be a function from messages to a text, or have a name (a text) and a method reply(messages, number), as "
         f"lare_rl.llm.live.LiveModel('NAME') has: {short_repr(model)} does not"
     )
 

@@ -54,16 +54,14 @@ def parse_reply(text: str) -> Reply:
         raise MalformedReplyError(f"the reply has {len(text)} characters; at most {_MAX_CHARACTERS} are read")
     _check_characters(text)
     try:
-        values = read_json(text, strict=False)
+        values, problem = read_json(text, strict=False), f"is JSON, but not an object: {text.strip()[:40]!r}"
     except ValueError as error:
-        values = _find_object(text)
-        if values is None:
-            reason = f": {error}" if "{" in text else ", and has no fenced function"
-            raise MalformedReplyError(f"the reply is not one JSON object{reason}") from error
+        reason = f": {error}" if "{" in text else ", and has no fenced function"
+        values, problem = None, f"is not one JSON object{reason}"
     if not isinstance(values, dict):
         values = _find_object(text)
-        if values is None:
-            raise MalformedReplyError(f"the reply is JSON, but not an object: {text.strip()[:40]!r}")
+    if values is None:
+        raise MalformedReplyError(f"the reply {problem}")
     try:
         reply = Reply(**values)
     except LareError as error:

@@ -53,8 +53,7 @@ def draft_multi_agent_task(environment_id: str) -> Draft:
     limit, arguments = find_time_limit(env, {}), _default_arguments(env)
     module, maker = split_environment(environment_id)
     name = file_name(module.rpartition(".")[2] if maker in GENERIC_MAKERS else maker)
-    max_steps = limit or draft.DEFAULT_LIMIT
-    task = make_stub(name, environment_id, env.possible_agents or (), max_episode_steps=max_steps)
+    task = make_stub(name, environment_id, env.possible_agents or (), max_episode_steps=limit or draft.DEFAULT_LIMIT)
     lines = [
         draft.GROUP_LINE,
         *([] if limit else [draft.LIMIT_LINE]),

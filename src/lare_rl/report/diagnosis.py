@@ -190,7 +190,8 @@ def _has_fallen(run: RunSummary) -> Finding | None:
     start = run.random_mean if len(run.random_returns) else float(run.finite_means[0])
     if len(run.random_returns) and best <= start + CLEAR_ERRORS * run.difference_error:
         return None
-    if best - last <= max(FALL_FRACTION * abs(best - start), 2 * change, CLEAR_ERRORS * run.final_difference_error):
+    error = math.sqrt(2) * run.final_error  # of a difference between two returns with equal errors
+    if best - last <= max(FALL_FRACTION * abs(best - start), 2 * change, CLEAR_ERRORS * error):
         return None
     return Finding("has_fallen", {"step": step, "return_": best, "directory": run.directory})
 

@@ -147,11 +147,6 @@ class RunSummary:
         return grouped_standard_error(self.final_returns, self.episode_error)
 
     @property
-    def final_difference_error(self) -> float:
-        """The standard error of the difference between the final return and another with an equal error."""
-        return math.sqrt(2) * self.final_error
-
-    @property
     def random_mean(self) -> float:
         return float(self.random_returns.mean())
 
@@ -307,7 +302,7 @@ def _episode_error(reported: ReportedRun, random_returns: Float[np.ndarray, " ep
     n = reported.run.config.settings.evaluation_episodes
     if n == 1:
         return sample_std(random_returns) / math.sqrt(len(stds))
-    return episode_error(stds**2 * n / max(1, n - 1), n)  # the deviations have n in the denominator
+    return episode_error(stds**2 * n / (n - 1), n)  # the deviations have n in the denominator
 
 
 def _score_metrics(reported: ReportedRun) -> dict[str, float]:

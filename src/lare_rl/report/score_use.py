@@ -71,8 +71,7 @@ def summarise_score_use(
     """Return how a run took the score. None for a method whose rewards do not add up to returns.
 
     Args:
-        settings: the settings of the run.
-        task: the task of the run.
+        method, settings, task: those of the run.
         metrics: the last `average`, `log_odds`, `gain` and `gain_error`; NaN where they are missing.
         equal_lengths: whether all episodes have the same length.
     """
@@ -92,7 +91,7 @@ def summarise_score_use(
         period=None if task.payments == "end" else task.payments,
         window=task.payment_rule.window,
         has_groups=task.group is not None,
-        exact=settings.credit.exact if settings.credit.exact in ("last", "spread") else "no",
+        exact=settings.credit.exact,
         equal_lengths=equal_lengths,
         gain=metrics["gain"],
         gain_error=metrics["gain_error"],

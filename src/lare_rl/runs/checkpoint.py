@@ -85,7 +85,7 @@ def take_snapshot(
     """Copy from the device what the next checkpoint saves. Call this only after the last checkpoint has been written.
 
     Args:
-        metadata: other data to save, as JSON.
+        metadata: other data to save as JSON, with the number of the `step`.
         arrays: other data to save, as arrays. Their names must not begin with a dot, or be `METADATA` or `ROW_FILES`.
     """
     capacity, newest_row = _capacity(learner), np.asarray(learner.replay.next_row)
@@ -247,9 +247,9 @@ def _capacity(learner: Any) -> int:
 
 
 def _parse_metadata(text: Any) -> dict[str, Any]:
-    """Read the metadata from JSON. Raise `ValueError` if they are not valid."""
+    """Read the metadata from JSON. Raise `ValueError` or `KeyError` if they are not valid."""
     metadata = read_json_object(str(text))
-    _check_counts([metadata[name] for name in ("step", "metrics_length") if name in metadata])
+    _check_counts([metadata["step"], metadata.get("metrics_length", 0)])
     digests = metadata.get("function_sha256", [])
     if not (isinstance(digests, list) and all(isinstance(digest, str) for digest in digests)):
         raise ValueError("function_sha256 is no list of texts")

@@ -12,7 +12,7 @@ import jax
 from lare_rl.config.migrate import CONFIG, FORMAT, migrate
 from lare_rl.config.settings import ResolvedSettings
 from lare_rl.envs.placement import load_env_spec
-from lare_rl.errors import CheckedModel, LareError
+from lare_rl.errors import CheckedModel, Count, LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.files import write_bytes
@@ -36,7 +36,7 @@ class Config(CheckedModel):
     settings: ResolvedSettings
     task: TaskSpec
     task_sha256: str
-    longest_episode: int
+    longest_episode: Count
     """The environment's time limit."""
     function_sha256: tuple[str, ...]
     """Hashes of the latent functions: one for each team, empty for a method without phi."""

@@ -42,12 +42,15 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
         DETERMINISTIC_RETURN: "Mean true return of the most likely actions, if the policy samples. On the host, at the last evaluation.",
     },
     "Methods with proxy rewards": {
-        RETURN_R2: "R² of the last 32 returns, each predicted before the decoder was fitted to it. Null until 8 are predicted.",
+        RETURN_R2: (
+            "R² of the last 32 returns, each predicted before the decoder was fitted to it; of the last 256 if an episode has several "
+            "payments, or is won or lost. Null until 8 are predicted."
+        ),
         "credit/gain": "Share of the squared error of the level's mean return that these predictions remove.",
         "credit/gain_error": "Standard error of `credit/gain`.",
         CREDIT_CORRELATION: (
             "Pearson's correlation of proxy and true rewards over the newest 5,000 steps or, if all episodes have one length, over those "
-            "of the last iteration. Null if the environment pays only at the end."
+            "of the last iteration. Null if only the last steps of episodes, or of segments, are paid."
         ),
         CREDIT_ERROR: "Mean of |proxy reward - true reward| over these steps, if both have the same unit. Null in the same case.",
         "credit/loss": "Gradient descent: the decoder's loss in units of the squared scale of R/T, mean over the last updates.",
@@ -72,6 +75,7 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
     "QMIX and VDN": {
         "critic/loss": "Half the mean squared error of the team's value, over the steps of the last update.",
         "critic/value": "Mean target of the team's value, over these steps.",
+        "algorithm/updates": "Number of updates in the last iteration that made any.",
     },
     "CreditAssigner only": {
         "credit/episodes": "Number of payments that were learned from or still wait. If episodes are paid once: of ended episodes.",

@@ -59,7 +59,7 @@ def truncate_metrics(directory: Path, n_bytes: int) -> None:
             os.truncate(path, n_bytes)
 
 
-@functools.lru_cache(maxsize=32)  # a report reads the metrics of a run twenty times
+@functools.lru_cache(maxsize=32)  # a comparison reads the metrics of a run several times
 def _parse_lines(path: Path, version: tuple[int, ...]) -> list[dict[str, Any]]:
     """Return the lines of a file. While its `version` is the same, it has not changed."""
     lines = []

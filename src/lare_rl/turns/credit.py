@@ -85,7 +85,7 @@ class CreditedTurns:
 
     @property
     def gain(self) -> float:
-        """The share of the squared error of GRPO's baseline that the values remove."""
+        """The share of the squared error of `group_means` that the values remove."""
         return self.trust.gain
 
     @property

@@ -122,8 +122,8 @@ def _match_results(identifiers: Sequence[str | int | None], results: Sequence[_R
     remaining = list(results)
     matched = []
     for identifier in identifiers:
-        same = (result for result in remaining if identifier is not None and result.identifier == identifier)
-        if result := next(same, None):
+        same = () if identifier is None else (result for result in remaining if result.identifier == identifier)
+        if result := next(iter(same), None):
             remaining.remove(result)
         matched.append(result)
     rest = iter(remaining)

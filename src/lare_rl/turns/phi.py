@@ -40,8 +40,7 @@ class TurnPhi:
             rows = [read_events(self.tree, *call, turn.text) for call in calls or [("", {}, turn.reply)]]
         except RefusedError as refusal:
             raise LareError(str(refusal)) from None
-        for number, row in enumerate(rows, start=1):
-            _check_names(row, rows[0], f"call {number}", "call 1")
+        _check_names(rows, "call")
         return {name: sum(row[name] for row in rows) for name in rows[0]}
 
 
@@ -54,13 +53,14 @@ def _read_arguments(text: str) -> dict[str, object]:
     return value if isinstance(value, dict) else {"text": text}
 
 
-def _check_names(row: Mapping[str, float], first: Mapping[str, float], where: str, where_first: str) -> None:
-    """Raise `LareError` if a call or a turn has other events than the first one."""
-    if difference := sorted(row.keys() ^ first.keys()):
-        raise LareError(
-            f"E-NAMES {where}: the events are not those of {where_first} ({', '.join(difference)[:200]}): return all events for "
-            "every call, with the value False or 0 if they did not happen"
-        )
+def _check_names(rows: Sequence[Mapping[str, float]], unit: str) -> None:
+    """Raise `LareError` if a call or a turn (the `unit` of the rows) has other events than the first one."""
+    for number, row in enumerate(rows, start=1):
+        if difference := sorted(row.keys() ^ rows[0].keys()):
+            raise LareError(
+                f"E-NAMES {unit} {number}: the events are not those of {unit} 1 ({', '.join(difference)[:200]}): return all events for "
+                "every call, with the value False or 0 if they did not happen"
+            )
 
 
 def read_turn_phi(source: str) -> TurnPhi:
@@ -93,8 +93,7 @@ def find_problems(phi: TurnPhi, turns: Sequence[Turn]) -> str:
     """Return a message to the author of a program that does not pass on these turns, or an empty text."""
     try:
         rows = [phi(turn) for turn in turns]
-        for number, row in enumerate(rows, start=1):
-            _check_names(row, rows[0], f"turn {number}", "turn 1")
+        _check_names(rows, "turn")
     except LareError as error:
         return str(error)
     if all(row == rows[0] for row in rows):

@@ -93,7 +93,7 @@ def sum_up(
     x_centred = np.where(varies(weight @ (x_centred / size) ** 2 / total, (x_mean / size) ** 2), x_centred, 0)
     y_std = np.sqrt(weight @ y_centred**2 / total)
     if not y_std > 1e-9 * np.abs(y).max(initial=0):
-        y_std, y_centred = 0.0, np.zeros_like(y)
+        y_mean, y_std, y_centred = y[0], 0.0, np.zeros_like(y)  # the mean of equal numbers has a rounding error
     weighted = weight[:, None] * x_centred
     s = weighted.T @ x_centred
     s += JITTER * np.diag(np.diagonal(s))

@@ -143,7 +143,7 @@ def _read_row(row: Any, what: str, where: str) -> Row:
 def _read_number(value: Any, where: str) -> float:
     try:
         number = float(value) if not isinstance(value, str | bytes) else math.nan
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one from a tensor of several numbers
         number = math.nan
     if not abs(number) <= MAX_NUMBER:
         raise LareError(

@@ -53,7 +53,7 @@ class Errors(NamedTuple):
     reduction: Float[np.ndarray, " rollouts"]
     """`baseline` minus the squared error of V, summed over the prefixes of a rollout."""
     baseline: Float[np.ndarray, " rollouts"]
-    """The squared error of the mean of the group, summed over the prefixes of a rollout."""
+    """The squared error of `group_means`, summed over the prefixes of a rollout."""
     surprise: Float[np.ndarray, " stopped"]
     """R - V before the last turn, of the rollouts that were not cut off."""
     outcome: Float[np.ndarray, " rollouts"]

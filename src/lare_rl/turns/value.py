@@ -10,10 +10,9 @@ The posterior standard deviation of a change is sqrt((x_(t+1) - x_t)^T Sigma (x_
 """
 
 import itertools
-from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from lare_rl.turns.features import TurnTable
 from lare_rl.turns.regression import PrefixFit, fit_linear
@@ -21,7 +20,7 @@ from lare_rl.turns.regression import PrefixFit, fit_linear
 __all__ = ["advantages", "changes", "fit_prefixes", "held_out_values", "posterior_stds", "values"]
 
 MAX_NUMBERS = 4_000_000
-"""The size of the largest array of covariances."""
+"""The largest size of an array of covariances, unless a single rollout needs more."""
 
 
 def fit_prefixes(table: TurnTable, x: Float[np.ndarray, "turns features"]) -> PrefixFit:
@@ -42,7 +41,9 @@ def values(table: TurnTable, x: Float[np.ndarray, "turns features"], fit: Prefix
     """Return V of the prefix before each turn. The intercept of a rollout's group leaves out the rollout itself."""
     (prediction, precision), index = _predict(table, x, fit), table.rollout_index
     residual = np.bincount(index, table.outcome[index] - prediction)
-    remaining_precision = np.maximum(fit.group_precision[table.group] - precision * table.length, 1e-12)
+    group_precision = fit.group_precision[table.group]
+    # Rounding must not make it 0. Its unit is that of 1 / outcome^2.
+    remaining_precision = np.maximum(group_precision - precision * table.length, 1e-15 * group_precision)
     return prediction - (precision * residual / remaining_precision)[index]
 
 
@@ -81,13 +82,6 @@ def _rows(table: TurnTable, x: Float[np.ndarray, "turns features"], fit: PrefixF
     return np.column_stack([x - fit.x_mean, np.ones(len(x))]) - fit.group_row[table.group][table.rollout_index]
 
 
-def _equal_lengths(length: Int[np.ndarray, " rollouts"]) -> Iterator[tuple[int, Int[np.ndarray, " some"]]]:
-    """Yield rollouts of equal length, at most so many that a matrix for each of them has `MAX_NUMBERS` numbers in all."""
-    for size in np.unique(length).tolist():
-        rollouts = np.flatnonzero(length == size)
-        yield from ((size, chunk) for chunk in np.array_split(rollouts, -(-len(rollouts) * size**2 // MAX_NUMBERS)))
-
-
 def held_out_values(
     table: TurnTable, x: Float[np.ndarray, "turns features"], fit: PrefixFit
 ) -> Float[np.ndarray, " turns"]:
@@ -100,13 +94,15 @@ def held_out_values(
     residual = table.outcome[table.rollout_index] - prediction
     rows = _rows(table, x, fit) @ fit.root.T
     held_out = np.empty_like(prediction)
-    for size, rollouts in _equal_lengths(table.length):
-        index = table.first[rollouts][:, None] + np.arange(size)
-        block = rows[index]
-        covariance = block @ block.swapaxes(1, 2) + 1 / fit.group_precision[table.group[rollouts]][:, None, None]
-        share = precision * covariance
-        # A single rollout determines m alone: without this, the system would be singular.
-        system = (1 + 1e-9) * np.eye(size) - share
-        change = np.linalg.solve(system, share @ residual[index][..., None])
-        held_out[index] = prediction[index] - change[..., 0]
+    for size in np.unique(table.length).tolist():
+        same_length = np.flatnonzero(table.length == size)
+        for rollouts in np.array_split(same_length, -(-len(same_length) * size**2 // MAX_NUMBERS)):
+            index = table.first[rollouts][:, None] + np.arange(size)
+            block = rows[index]
+            covariance = block @ block.swapaxes(1, 2) + 1 / fit.group_precision[table.group[rollouts]][:, None, None]
+            share = precision * covariance
+            # A single rollout determines m alone: without this, the system would be singular.
+            system = (1 + 1e-9) * np.eye(size) - share
+            change = np.linalg.solve(system, share @ residual[index][..., None])
+            held_out[index] = prediction[index] - change[..., 0]
     return held_out
