@@ -48,7 +48,7 @@ def phi(tmp_path):
         ("prompt CompetitivePP-6", ["CompetitivePP-6-predator, CompetitivePP-6-prey"]),
         ("verify none.py --task Reacher-v4", ["none.py does not exist"]),
         ("design Reacher-v4 --draw 7", ["draw 7", "0, 1, 2, 3, 4"]),
-        ("design Reacher-v4 --draw 1 --model m", ["--draw"]),
+        ("design Reacher-v4 --draw 1 --model m.json", ["--draw"]),
         ("design Reacher-v4 --budget 9", ["--budget", "--model"]),
         ("design Reacher-v4 --model m --budget 0", ["budget = 0"]),
         ("design Reacher-v4 --policy run", ["--policy", "--reflect"]),

@@ -105,7 +105,7 @@ def test_live_model_to_trained_policy(serve, command, design_live, tmp_path):
             to_reply("x = np.load('a')\ny = np.fromfile('b')"),
             ["--record", "talk.json"],
             1,
-            ["'Reacher-v4'", "E-NUMPY line 1", " (and 1 more)"],
+            ["Reacher-v4: ", "E-NUMPY line 1", " (and 1 more)"],
             5,
         ),
     ],

@@ -61,23 +61,17 @@ CUTS = {
     r"--steps 50000": "--steps 400 --rollout-steps 200 --evaluation-episodes 1",
     r"--resume runs/first --steps 205000": "--resume runs/first --steps 400",
     r"steps=(100|20)_000": "steps=400, evaluation_episodes=1",
-    r"learn\(10_000": "learn(1100",
     r"learning_starts=2000": "learning_starts=1000",
     r"--seeds 3|seeds=3": lambda match: match[0].replace("3", "2"),
-    r"(lare-rl train (CN|PP|CompetitivePP|TriangleArea)-?6?.*)": r"\1 --steps 200 --environments 4 --evaluation-episodes 1",
+    r"(lare-rl train (CN|CompetitivePP)-6.*)": r"\1 --steps 200 --environments 4 --evaluation-episodes 1",
     r"(lare-rl train spread.toml.*)": r"\1 --steps 2000 --evaluation-episodes 1",
-    r"lare-rl train SMAX-\w+": "lare-rl train SMAX-2s3z",
     r"--qmix.* --steps": "--steps",
     r" --processes 2": "",
-    r"(lare-rl train SMAX-.* --algorithm ippo.*)": r"\1 --steps 2050 --environments 2 --evaluation-episodes 1",
     r"(lare-rl train SMAX-\S+(?: --method \S+)?)(?: --steps \d+)? *$": r"\1 --steps 1200 --environments 2 --evaluation-episodes 1",
-    r"(lare-rl train \S+ --method \w+-?\w*)$": r"\1 --steps 200 --td3.warmup 100 --evaluation-episodes 1",
     r"--budget laptop|reproduce errors": lambda match: f"{match[0].split(' --')[0]} --budget smoke",
     r"--episodes 20|episodes=20": lambda match: match[0].replace("20", "1"),
-    r"learn\(1_000_000": "learn(1100",
-    r"learn\(100_000": "learn(1100",
+    r"learn\((10|100|1_000)_000": "learn(1100",
     r"http://localhost:5000": "file:mlruns",
-    r"runs/\.\.\.": "runs/Reacher-v4-lare-bayes-td3-s0",
 }
 """Replacements by regular expression: short runs, on a task of short episodes."""
 
@@ -151,13 +145,13 @@ class Page:
             exec(compile(SELF_HOSTED.sub(self.url, shorten(text)), "snippet", "exec"), self.names)
 
 
-def block(page, language, number):
-    return [text for name, text in blocks(ROOT / page) if name == language][number]
+def first_block(page, language):
+    return next(text for name, text in blocks(ROOT / page) if name == language)
 
 
-PENDULUM = block("docs/tutorials/your-own-environment.md", "python", 0)
-PENDULUM_TASK = block("docs/tutorials/your-own-environment.md", "toml", 0)
-STUDY = block("docs/how-to/sweeps.md", "toml", 0).replace("processes = 2", "processes = 1")
+PENDULUM = first_block("docs/tutorials/your-own-environment.md", "python")
+PENDULUM_TASK = first_block("docs/tutorials/your-own-environment.md", "toml")
+STUDY = first_block("docs/how-to/sweeps.md", "toml").replace("processes = 2", "processes = 1")
 API_NAMES = """
 import gymnasium, numpy as np
 envs = gymnasium.make_vec('Reacher-v4', num_envs=4)
@@ -254,7 +248,7 @@ def train_run(page):
 
 def prepare_runs(page):
     train_run(page)
-    page.write("cheetah.toml", shorten(block("docs/how-to/runs.md", "toml", 0)))
+    page.write("cheetah.toml", shorten(first_block("docs/how-to/runs.md", "toml")))
 
 
 def prepare_api(page):
@@ -275,7 +269,7 @@ def export_policy(page):
 
 def prepare_models(page):
     page.serve(PENDULUM)
-    page.write("pendulum.toml", block("docs/tutorials/your-own-environment.md", "toml", 0))
+    page.write("pendulum.toml", PENDULUM_TASK)
     page.names["my_client"] = SimpleNamespace(ask=lambda messages: to_reply(PENDULUM))
     name = "lare_rl.integrations.pydantic_ai"  # its library may be missing; tests/integrations has its tests
     adapter = SimpleNamespace(pydantic_ai_model=lambda name: page.names["my_model"])
@@ -300,7 +294,7 @@ PREPARE = {
     "docs/how-to/export.md": export_policy,
     "docs/how-to/extend.md": prepare_plugin,
     "docs/how-to/jax-environments.md": lambda page: page.write(
-        "pendulum.toml", block("docs/how-to/jax-environments.md", "toml", 0)
+        "pendulum.toml", first_block("docs/how-to/jax-environments.md", "toml")
     ),
     "docs/tutorials/your-own-logs.md": write_logs,
     "docs/how-to/libraries/sb3.md": lambda page: lare_rl.design("Reacher-v4").save(page.directory / "phi.py"),
@@ -308,7 +302,7 @@ PREPARE = {
     "docs/how-to/runs.md": prepare_runs,
     "docs/reference/files.md": train_run,
     "docs/reference/starcraft.md": write_study,
-    "skills/lare/SKILL.md": lambda page: page.write("phi.py", block("skills/lare/SKILL.md", "python", 0)),
+    "skills/lare/SKILL.md": lambda page: page.write("phi.py", first_block("skills/lare/SKILL.md", "python")),
     "docs/how-to/sweeps.md": write_study,
 }
 """What the reader of a page already has."""

@@ -52,7 +52,8 @@ CONDITIONS: dict[str, dict[str, str]] = {
         "trust_sums": f"It is larger, and above {CLEAR_GAIN:.0%}.",
     },
     "The next step": {
-        "explains_little": f"Closed forms: R² is below {LITTLE_R2} at the end and in most evaluations.",
+        "explains_little": f"Closed forms: R² is below {LITTLE_R2} at the end and in most evaluations, and single steps do not agree. Of a "
+        f"score that is won or lost: `credit/gain` is at most {CLEAR_ERRORS} of its standard errors.",
         "try_closed_form": "The same for gradient descent.",
         "is_rising": "The last quarter of the evaluations is above the quarter before by more than the usual change and a standard error, "
         "and rose by more than half of the usual change.",

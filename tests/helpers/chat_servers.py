@@ -79,7 +79,7 @@ class Handler(BaseHTTPRequestHandler):
             self.send_header(name.replace("_", "-"), value)
         self.end_headers()
 
-    def send_forever(self, chunk: bytes, pause_s: float = 0.0) -> None:
+    def send_forever(self, chunk: bytes, pause_s: float) -> None:
         try:
             while True:
                 self.wfile.write(chunk)
@@ -142,12 +142,12 @@ def break_off(handler: Handler) -> None:
     handler.connection.shutdown(socket.SHUT_RDWR)
 
 
-def drip_body(status: int) -> Answer:
-    """Send a byte of the body now and then, without end."""
+def endless_body(status: int, chunk: bytes, pause_s: float = 0.0) -> Answer:
+    """Send one chunk of the body after the other, without end."""
 
     def answer(handler: Handler) -> None:
         handler.begin(status)
-        handler.send_forever(b" ", pause_s=0.05)
+        handler.send_forever(chunk, pause_s)
 
     return answer
 
@@ -155,26 +155,9 @@ def drip_body(status: int) -> Answer:
 def drip_headers(handler: Handler) -> None:
     """Send a letter of a header now and then, without end."""
     handler.wfile.write(b"HTTP/1.1 200 OK\r\nX-Slow: ")
-    handler.send_forever(b"a", pause_s=0.05)
+    handler.send_forever(b"a", 0.05)
 
 
-def flood(status: int) -> Answer:
-    """Send one megabyte after the other, without end."""
-
-    def answer(handler: Handler) -> None:
-        handler.begin(status)
-        handler.send_forever(b" " * (1 << 20))
-
-    return answer
-
-
-def compress(encoding: str, times: int) -> Answer:
+def send_bomb(handler: Handler) -> None:
     """Send 16 MB in a few bytes."""
-
-    def answer(handler: Handler) -> None:
-        body = b" " * (16 << 20)
-        for _ in range(times):
-            body = gzip.compress(body)
-        handler.send(200, body, Content_Encoding=encoding)
-
-    return answer
+    handler.send(200, gzip.compress(gzip.compress(b" " * (16 << 20))), Content_Encoding="gzip, gzip")

@@ -48,9 +48,9 @@ def play(env: JaxEnv, n_envs: int, n_steps: int) -> tuple[Timestep, np.ndarray, 
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(unroll))(keys))
 
 
-def step_keys(n_envs: int, n_steps: int, env_index: int = 0) -> tuple[jax.Array, list[jax.Array]]:
-    """Return the keys of `play` as the packages take them: that of the reset, and those of the steps."""
-    key = jax.random.split(jax.random.key(0), n_envs)[env_index]
+def step_keys(n_envs: int, n_steps: int) -> tuple[jax.Array, list[jax.Array]]:
+    """Return the keys of `play` in its first environment, as the packages take them: that of the reset, and those of the steps."""
+    key = jax.random.split(jax.random.key(0), n_envs)[0]
     return jax.random.key_data(key), [jax.random.key_data(key) for key in jax.random.split(key, n_steps)]
 
 

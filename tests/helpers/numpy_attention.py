@@ -28,9 +28,10 @@ def numpy_gelu(x):
 
 
 def numpy_mlp(mlp, x, activation=lambda x: np.maximum(x, 0)):
-    """Return the output of two layers with an activation between them."""
-    first, second = mlp.layers
-    return numpy_linear(second, activation(numpy_linear(first, x)))
+    """Return the output of some layers with an activation between them."""
+    for layer in mlp.layers[:-1]:
+        x = activation(numpy_linear(layer, x))
+    return numpy_linear(mlp.layers[-1], x)
 
 
 def numpy_time_layer(layer, x):

@@ -41,13 +41,10 @@ def numpy_networks(numbers) -> Networks:
 
 
 def numpy_sequences() -> Sequences:
-    arrays = {name: jnp.asarray(PINNED[name], jnp.float32) for name in ("obs", "state", "reward", "terminated", "mask")}
+    def array(name, dtype=jnp.float32):
+        return jnp.asarray(PINNED[name], dtype)
+
+    action = jax.nn.one_hot(array("action", int), 3)
     return Sequences(
-        arrays["obs"],
-        arrays["state"],
-        jnp.asarray(PINNED["legal"], bool),
-        jax.nn.one_hot(jnp.asarray(PINNED["action"]), 3),
-        arrays["reward"],
-        arrays["terminated"],
-        arrays["mask"],
+        array("obs"), array("state"), array("legal", bool), action, *map(array, ("reward", "terminated", "mask"))
     )

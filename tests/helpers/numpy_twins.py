@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from helpers.numpy_attention import numpy_mlp
 from lare_rl.algorithms.batches import Transitions
 
 
@@ -14,18 +15,11 @@ def random_transitions():
     return Transitions(*map(jnp.asarray, (s, np.tanh(a), r, n, np.float32(np.arange(16) % 4 == 0))))
 
 
-def mlp_forward(network, x):
-    """Return the outputs of an MLP."""
-    for layer in network.layers[:-1]:
-        x = np.maximum(x @ np.asarray(layer.weight) + np.asarray(layer.bias), 0)
-    return x @ np.asarray(network.layers[-1].weight) + np.asarray(network.layers[-1].bias)
-
-
 def q_values(critics, observation, action):
     """Return the values of each critic."""
     x, critics = np.concatenate([observation, action], axis=1), jax.tree.map(np.asarray, critics)
     count = len(critics.layers[0].weight)
-    return np.stack([mlp_forward(jax.tree.map(lambda leaf, i=i: leaf[i], critics), x)[:, 0] for i in range(count)])
+    return np.stack([numpy_mlp(jax.tree.map(lambda leaf, i=i: leaf[i], critics), x)[:, 0] for i in range(count)])
 
 
 def equal(a, b):

@@ -71,19 +71,3 @@ class Toy(ParallelEnv):
 
 def raises():
     raise OSError("no asset\ntrack.bin")
-
-
-def nothing():
-    return 3
-
-
-class Capitals(Toy):
-    """Hunters hunt.
-
-    # Observation Space
-    Hunter observation: its speed.
-    Prey observation: its distance.
-    """
-
-    def __init__(self, **more):
-        super().__init__(("Hunter_0", "Prey_0"), **more)

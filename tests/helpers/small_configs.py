@@ -144,51 +144,40 @@ def with_other_dead_values(steps):
     )
 
 
-def random_factors(config, steps, seed=1):
+def random_factors(config, steps):
     """Return random factors of every row."""
     shape = (*steps.ended.shape, config.n_proxy_rewards, max(config.n_factors, default=0))
-    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+    return np.random.default_rng(1).normal(size=shape).astype(np.float32)
 
 
-def untrained_learner(config, seed=0):
+def untrained_learner(config):
     """Return an untrained learner. It is not compiled: single operations are shared by all configurations."""
-    return learners.init_learner(jax.random.key(seed), config, partial(init_algorithm, config=config))
+    return learners.init_learner(jax.random.key(0), config, partial(init_algorithm, config=config))
 
 
-def steps_as_stored(config, steps=None, factors=None):
-    """Return steps of the first environment, which are whole episodes, as `stored_steps` does, without a replay."""
-    steps = random_steps(config.env) if steps is None else steps
+def steps_as_stored(config, steps):
+    """Return the columns of the first environment's steps as `stored_steps` does, without a replay and its other fields."""
     timestep, next_timestep = (
         {name: getattr(timestep, name)[:, 0] for name in STEP_COLUMNS}
         for timestep in (steps.timestep, steps.next_timestep)
     )
     columns = timestep | {
         "action": steps.action[:, 0],
-        "factors": (random_factors(config, steps) if factors is None else factors)[:, 0],
+        "factors": random_factors(config, steps)[:, 0],
         "reward": steps.next_timestep.reward[:, 0],
         "terminated": steps.next_timestep.terminated[:, 0],
     }
-    last = steps.ended[:, 0]
-    length = np.diff(np.flatnonzero(last), prepend=-1)
-    by_team = [team_rewards(steps, team) for team in config.env.teams]
-    total = np.add.reduceat(np.stack(by_team, axis=-1), np.cumsum(length) - length).astype(np.float32)
     return replay.StoredSteps(
-        columns={name: jnp.asarray(columns[name]) for name in config.columns},
-        next_columns={name: jnp.asarray(next_timestep[name]) for name in STEP_COLUMNS if name in config.columns},
-        episodic_reward=jnp.asarray(np.where(last[:, None], np.repeat(total, length, axis=0), 0)),
-        mean_reward=jnp.asarray(np.repeat(total / length[:, None], length, axis=0), jnp.float32),
-        episode_ended=jnp.ones(len(last), bool),
-        last=jnp.asarray(last),
-        residual=None,
-        level=None,
-        length=jnp.asarray(np.repeat(length, length), jnp.int32),
+        {name: jnp.asarray(columns[name]) for name in config.columns},
+        {name: jnp.asarray(next_timestep[name]) for name in STEP_COLUMNS if name in config.columns},
+        *[None] * 7,
     )
 
 
-def team_rewards(steps, team, env=0):
+def team_rewards(steps, team):
     """Return the team's reward of each step: the mean over its agents that are alive, by a loop."""
     means = []
-    for reward, alive in zip(steps.next_timestep.reward[:, env], steps.timestep.alive[:, env], strict=True):
+    for reward, alive in zip(steps.next_timestep.reward[:, 0], steps.timestep.alive[:, 0], strict=True):
         values = [reward[agent] for agent in range(team.start, team.stop) if alive[agent]]
         means.append(np.mean(values) if values else 0.0)
     return np.array(means)

@@ -44,7 +44,8 @@ def test_cache_variables(tmp_path):
 
 @pytest.mark.parametrize(
     "variables",
-    [{"LARE_CACHE": "off"}, {"LARE_CACHE": " OFF "}, {"JAX_COMPILATION_CACHE_DIR": "other"}, {"LARE_CACHE": __file__}],
+    [{"LARE_CACHE": name} for name in ("off", " OFF ", __file__, "~nobody-of-this-name/cache")]
+    + [{"JAX_COMPILATION_CACHE_DIR": "other"}],
 )
 def test_no_cache(variables):
     assert cache_variables(variables) == {}

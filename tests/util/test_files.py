@@ -32,6 +32,13 @@ def test_failed_write_keeps_the_old_file(tmp_path, error, expected):
     assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("table.csv", b"old")]
 
 
+@pytest.mark.parametrize("name", ["n" * 300, "file/table.csv"])
+def test_impossible_path(tmp_path, name):
+    (tmp_path / "file").touch()
+    with pytest.raises(LareError, match="cannot be written"):
+        write_atomically(tmp_path / name, lambda file: None)
+
+
 def test_two_writers(tmp_path):
     path = tmp_path / "table.csv"
 

@@ -16,12 +16,13 @@ from lare_rl.cli.logs import relabel
 from lare_rl.cli.parse import parse
 from lare_rl.cli.runs import cross_play, evaluate, export, report
 from lare_rl.cli.studies import compare, reproduce, sweep
-from lare_rl.cli.terminal import discard_output, print_error, print_line
+from lare_rl.cli.terminal import discard_output, print_line, print_progress
 from lare_rl.cli.train import train
 from lare_rl.cli.turns import turn_credit, turn_phi
 from lare_rl.errors import LareError
 from lare_rl.util import compilation
 from lare_rl.util.provenance import code_version
+from lare_rl.util.sanitize import one_line
 
 DESCRIPTION = (
     "LaRe: a reward for every step, from one number per episode. "
@@ -76,7 +77,7 @@ def main() -> None:
     except (LareError, OSError) as error:
         if debug:
             traceback.print_exc()
-        print_error(error)
+        print_progress(f"lare-rl: {one_line(error)}")
         if isinstance(error, LareError):
             sys.exit(error.status)
         with contextlib.suppress(OSError):  # it may be stdout that failed: Python would write to it again at exit

@@ -20,7 +20,7 @@ from lare_rl.cli.terminal import (
     print_progress,
 )
 from lare_rl.errors import LareError
-from lare_rl.llm.prompts import FunctionKind
+from lare_rl.llm.prompts import N_CANDIDATES, FunctionKind
 from lare_rl.util.files import check_new_path, find_free_path
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def design(
     model_name: Annotated[str | None, tyro.conf.arg(name="model", metavar="STR")] = None,
     live: Annotated[LiveOptions, tyro.conf.arg(name="")] = DEFAULT_LIVE,
     draw: int = 0,
-    candidates: int = 5,
+    candidates: int = N_CANDIDATES,
     reflect: int = 0,
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
     pre_verification: bool = True,
@@ -68,12 +68,22 @@ def design(
     from lare_rl.llm.recording import RECORDED
 
     model_name = RECORDED if model_name is None else model_name
-    is_live = model_name != RECORDED and not model_name.endswith(".json")
-    _check_options(is_live, live, draw, reflect, policy, data)
+    path = None if model_name == RECORDED else Path(model_name)
+    is_live = path is not None and path.suffix != ".json"
+    live_options = ", ".join(f"--{name.replace('_', '-')}" for name in LiveOptions.model_fields)
+    problems = [
+        (path and draw, "--draw chooses a shipped recording, and --model names another model: leave --draw out"),
+        (not is_live and live != DEFAULT_LIVE, f"{live_options} are for a live model: name it with --model NAME"),
+        (policy and not reflect, "--policy plays the episodes for --reflect: give --reflect a number of rounds"),
+        (reflect < 0, f"reflect = {reflect}: the number of rounds cannot be negative"),
+        (data and reflect, "--reflect plays episodes, and --data is for tasks without an environment: leave one out"),
+    ]
+    for applies, message in problems:
+        if applies:
+            raise LareError(message)
     out = check_function_files(out, record)
     spec = lare_rl.load_task(task) if data is None else read_task(task)
     play, steps = load_playing_policy(policy, spec), load_steps(data, spec)
-    path = None if model_name == RECORDED else Path(model_name)
     model = live.open(model_name) if is_live else recorded_model(spec.name, kind, draw, path)
     options: dict[str, Any] = {"candidates": candidates, "pre_verification": pre_verification, "steps": steps}
     with record_replies(spec.name, model, live, record) as recording:
@@ -109,9 +119,8 @@ def record_replies(name: str, model: "Model", live: LiveOptions, record: Path | 
             path.unlink(missing_ok=True)
     except BaseException as error:
         has_replies = isinstance(error, DesignError)
-        if (
-            has_replies and not error.recorder.is_saved
-        ):  # the disk may be full, or another design may have taken the name
+        # The disk may be full, or another design may have taken the name.
+        if has_replies and not error.recorder.is_saved:
             print_line(error.recorder.to_json())
         elif has_replies or (model.budget.requests_used and path.exists()):  # a file that existed before is not ours
             print_progress(f"every reply is kept in {path}")
@@ -130,23 +139,6 @@ def _next_command(task: str, spec: "TaskSpec", out: Path, kind: FunctionKind, da
         return f"to use it: lare-rl relabel {shlex.quote(data)} --task {task} --function {function} --out NEW"
     method = " --method llm-reward" if kind == "reward" else ""
     return f"to train with it: lare-rl train {task} --function {function}{method}"
-
-
-def _check_options(
-    is_live: bool, live: LiveOptions, draw: int, reflect: int, policy: Path | None, data: str | None
-) -> None:
-    """Raise `LareError` if options do not go together."""
-    live_options = ", ".join(f"--{name.replace('_', '-')}" for name in LiveOptions.model_fields)
-    problems = [
-        (is_live and draw != 0, "--draw chooses a recording, and a live model uses none: leave --draw out"),
-        (not is_live and live != DEFAULT_LIVE, f"{live_options} are for a live model: name it with --model NAME"),
-        (policy and not reflect, "--policy plays the episodes for --reflect: give --reflect a number of rounds"),
-        (reflect < 0, f"reflect = {reflect}: the number of rounds cannot be negative"),
-        (data and reflect, "--reflect plays episodes, and --data is for tasks without an environment: leave one out"),
-    ]
-    for applies, message in problems:
-        if applies:
-            raise LareError(message)
 
 
 def check_function_files(out: Path | None, record: Path | None = None) -> Path | None:

@@ -134,7 +134,7 @@ def reproduce(
     from lare_rl.cli.sweep_progress import show_progress
     from lare_rl.training.train import RunInterruptedError
 
-    paper = _import_from_checkout("reproduce")
+    paper = _import_exhibits()
     if exhibit is None:
         print_table(("exhibit", "of the paper", "what it shows"), paper.listed())
         return
@@ -160,13 +160,13 @@ def reproduce(
         sys.exit(1)
 
 
-def _import_from_checkout(module: str) -> ModuleType:
-    """Import a module of `benchmarks/paper`, which only a checkout has."""
-    if not (_BENCHMARKS / "paper" / f"{module}.py").is_file():
+def _import_exhibits() -> ModuleType:
+    """Import `benchmarks/paper/reproduce.py`, which only a checkout has."""
+    if not (_BENCHMARKS / "paper" / "reproduce.py").is_file():
         raise LareError(
             "lare-rl reproduce needs a checkout, which describes the exhibits: clone the repository, and install it there by "
             "pip install -e '.[all]'"
         )
     if str(_BENCHMARKS) not in sys.path:
         sys.path.append(str(_BENCHMARKS))
-    return importlib.import_module(f"paper.{module}")
+    return importlib.import_module("paper.reproduce")

@@ -23,12 +23,8 @@ def show_progress(jobs: Sequence[Job]) -> Iterator[Callable[[str], None]]:
         yield print_progress
         return
     console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f}%"),
-        TimeRemainingColumn(),
-    )
+    percentage = TextColumn("{task.percentage:>3.0f}%")
+    columns = TextColumn("{task.description}"), BarColumn(), percentage, TimeRemainingColumn()
     ended = threading.Event()
     with Progress(*columns, console=console, transient=True) as bars:
         thread = threading.Thread(target=update_bars, args=(jobs, bars, ended), daemon=True)

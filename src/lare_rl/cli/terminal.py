@@ -15,7 +15,7 @@ from lare_rl.errors import CheckedModel, Count, LareError
 from lare_rl.llm.budget import Budget
 from lare_rl.llm.prompts import FunctionKind, Message
 from lare_rl.util.findings import format_for_reader
-from lare_rl.util.sanitize import one_line, sanitize
+from lare_rl.util.sanitize import sanitize
 
 if TYPE_CHECKING:
     from lare_rl.envs.play import Policy
@@ -128,11 +128,6 @@ class EpisodeProgress:
             print_progress(
                 f"played {n_done} of {self._n_episodes} episodes, {format_for_reader(seconds_left, 'seconds')} left"
             )
-
-
-def print_error(error: Exception) -> None:
-    """Print an error to stderr, in one line."""
-    print_progress(f"lare-rl: {one_line(error)}")
 
 
 def load_steps(data: str | None, task: "TaskSpec") -> "Steps | None":

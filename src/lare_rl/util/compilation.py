@@ -55,11 +55,12 @@ def _prepare_cache(variables: Mapping[str, str]) -> dict[str, str | float]:
     setting = variables.get("LARE_CACHE", "").strip()
     if setting.lower() == "off":
         return {}
-    directory = (Path(setting).expanduser() if setting else user_cache_path("lare")) / f"compiled-{_processor_hash()}"
     try:
+        root = Path(setting).expanduser() if setting else user_cache_path("lare")
+        directory = root / f"compiled-{_processor_hash()}"
         directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         _remove_incomplete_programs(directory)
-    except OSError:
+    except (OSError, RuntimeError):  # there may be no home directory
         return {}
     if not os.access(directory, os.W_OK):
         return {}

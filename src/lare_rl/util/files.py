@@ -96,23 +96,21 @@ def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
 
     Raises `LareError` if the file cannot be written.
     """
-    if path.exists() and not path.is_file() and not path.is_dir():
-        # A device, such as /dev/null, or a pipe is never replaced.
-        with report_write_error(path), path.open("wb") as file:
-            write(file)
-        return
     new = path.with_name(f"{path.name}.{uuid4().hex}.new")  # unique: another process may write the same file
-    try:
-        with new.open("wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        _move(new, path)
-    except OSError as error:
-        reason = error.strerror or error
-        raise LareError(f"{path} cannot be written ({reason}); an existing file is unchanged") from error
-    finally:  # an interruption must not leave the new file either
-        new.unlink(missing_ok=True)
+    with report_write_error(path, "; an existing file is unchanged"):
+        if path.exists() and not path.is_file() and not path.is_dir():
+            # A device, such as /dev/null, or a pipe is never replaced.
+            with path.open("wb") as file:
+                write(file)
+            return
+        try:
+            with new.open("wb") as file:
+                write(file)
+                file.flush()
+                os.fsync(file.fileno())
+            _move(new, path)
+        finally:  # an interruption must not leave the new file either
+            new.unlink(missing_ok=True)
 
 
 def remove_partial_files(path: Path) -> None:
