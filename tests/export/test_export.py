@@ -29,8 +29,12 @@ from lare_rl.envs.interface import to_env_action
 from lare_rl.envs.load import read_task
 from lare_rl.export import export as export_module
 from lare_rl.export.policy_graph import policy_graph
-from lare_rl.latent.function import verify_function
+from lare_rl.export.reward_graph import _StepInputs
+from lare_rl.export.translate import finish
+from lare_rl.latent.function import LatentFunction, verify_function
+from lare_rl.phi.builder import Builder, building
 from lare_rl.phi.evaluate import evaluate
+from lare_rl.phi.limits import UNLIMITED
 from lare_rl.training import learner as learners
 from lare_rl.training.policy import compile_policy, get_actor, init_memory, policy_input
 from lare_rl.training.rewards import rewards
@@ -167,6 +171,21 @@ def test_policy_graph_of_teams(algorithm, env):
     assert outputs.keys() == expected.keys()
     for name, values in outputs.items():
         np.testing.assert_allclose(values, expected[name], rtol=2e-5, atol=2e-5)
+
+
+def test_phi_of_a_team_reads_the_actions_of_its_agents():
+    """With the credit scope "state", decoders read the actions of all agents."""
+    config = small_config(
+        "lare-linear", "ippo", replace(TWO_TEAMS, state_size=2), n_factors=(1, 1), credit_scope="state"
+    )
+    source = PHI.replace(", o[:, 1:2]", "")
+    for index, agents in enumerate((slice(0, 3), slice(3, 5))):
+        phi = LatentFunction("toy", "factors", source, 1, (), (2, 4 * (agents.stop - agents.start)))
+        with building(Builder(UNLIMITED)):
+            graph = finish(factors=_StepInputs(config, (), index, phi)["factors"])
+        action = np.arange(20.0)[None]
+        outputs = evaluate(graph, {"after": np.array([[2.0, 0.0]]), "action": action})
+        assert outputs["factors"].item() == 2 * action.reshape(5, 4)[agents].sum()
 
 
 def policy_case(config, actor):

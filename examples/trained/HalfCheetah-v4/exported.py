@@ -72,7 +72,11 @@ def load(name):
     def function(**inputs):
         needed = ", ".join(entry["inputs"])
         if missing := [key for key in entry["inputs"] if key not in inputs]:
-            length = " (length is the number of steps of the episode)" if "length" in missing else ""
+            length = (
+                " (length is the number of steps of the episode, or that its payment is for)"
+                if "length" in missing
+                else ""
+            )
             raise ValueError(f"{name} needs the inputs {needed}: {', '.join(missing)} is missing{length}")
         if unknown := [key for key in inputs if key not in entry["inputs"]]:
             raise ValueError(f"{name} needs the inputs {needed}: there is no input {', '.join(unknown)}")

@@ -17,10 +17,10 @@ __all__ = ["collect_results", "select_runs"]
 def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[LearningCurve], list[Finding]]:
     """Read the results in run directories and tables (.csv), and find what the user should know about them.
 
-    The first label is the baseline; of a single directory, it is `episodic`, if that was trained. Runs come before tables, unless the
-    first path is a table: its first method is the baseline.
+    The first label is the baseline: that of the first path or, of a single directory, `episodic`, if that was trained. The other
+    methods of tables come after all runs.
 
-    Raises `LareError` if there is nothing to compare, or a table cannot be read.
+    Raises `LareError` if a path has nothing to compare, or a file is damaged.
     """
     tables = [path for path in paths if path.suffix == ".csv"]
     directories = [path for path in paths if path not in tables]
@@ -32,8 +32,8 @@ def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[L
     run_results = read_run_results(label_runs(runs), metric)
     table_results = [result for path in tables for result in read_results_table(path, metric)]
     if run_results:
-        findings += _find_other_tasks(run_results, table_results)
-        tasks = {result.task for result in run_results}
+        tasks = sorted({result.task for result in run_results})
+        findings += _find_other_tasks(tasks, table_results)
         table_results = [result for result in table_results if result.task in tasks]
         findings += _find_other_steps(run_results, table_results, metric)
     results = run_results + table_results
@@ -57,7 +57,10 @@ def select_runs(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], l
             findings.append(Finding("no_evaluation", {"run": run.directory}))
             continue
         names |= {name for line in lines for name in line}
-        (selected if any(line.get(metric) is not None for line in lines) else without_metric).append(run)
+        if not any(line.get(metric) is not None for line in lines):
+            without_metric.append(run)
+            continue
+        selected.append(run)
         if (step := lines[-1]["step"]) < steps:
             findings.append(Finding("unfinished", {"run": run.directory, "step": step, "steps": steps}))
         if reason := describe_untrained(run):
@@ -77,23 +80,22 @@ def select_runs(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], l
     return selected, findings
 
 
-def _find_other_tasks(run_results: Sequence[LearningCurve], table_results: Sequence[LearningCurve]) -> list[Finding]:
-    """Report the tasks of tables that no run has."""
-    tasks = tuple(sorted({result.task for result in run_results}))
+def _find_other_tasks(tasks: Sequence[str], table_results: Sequence[LearningCurve]) -> list[Finding]:
+    """Report the tasks of tables that no run has. `tasks` are those of the runs."""
     unknown = dict.fromkeys((result.source, result.task) for result in table_results if result.task not in tasks)
-    return [Finding("other_task", {"source": source, "task": task, "tasks": tasks}) for source, task in unknown]
+    return [Finding("other_task", {"source": source, "task": task, "tasks": tuple(tasks)}) for source, task in unknown]
 
 
 def _find_other_steps(
     run_results: Sequence[LearningCurve], table_results: Sequence[LearningCurve], metric: str
 ) -> list[Finding]:
-    """Report the methods of tables that lack the last step of the runs."""
-    curves = group_pairs((result.task, result.values) for result in run_results if result.values)
-    last_steps = {task: min(map(max, values)) for task, values in curves.items()}  # of the shortest curve on each task
+    """Report the methods of tables that lack the last step that all runs have."""
+    curves = group_pairs((result.task, set(result.values)) for result in run_results if result.values)
+    last_steps = {task: max(set.intersection(*steps), default=None) for task, steps in curves.items()}
     missing = dict.fromkeys(
         (result.source, result.label, step)
         for result in table_results
-        if (step := last_steps[result.task]) not in result.values
+        if (step := last_steps[result.task]) is not None and step not in result.values
     )
     return [
         Finding("other_steps", {"source": source, "metric": metric, "label": label, "step": step})

@@ -71,7 +71,7 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
         step = int(best_steps[seed_index])
     graphs = {"policy": policy_graph(select_seed(actors, seed_index), config)}
     decoders = select_seed(state.learner.decoders, seed_index)
-    no_reward_reason = missing_reward_reason(config.method)
+    no_reward_reason = missing_reward_reason(config)
     if no_reward_reason is None:
         for team_index, role in enumerate(task.roles):
             phi = run.functions[team_index] if run.functions else None

@@ -2,7 +2,7 @@
 
     before, after [batch *agents observation]       observations before and after a step
     action [batch *agents action]                   in the environment's units; a choice is a one-hot row
-    length [batch], or [batch 1] if there are agents    T of the step's episode, if the score is a mean over its steps
+    length [batch], or [batch 1] if there are agents    if the score is an average: the number of steps that the payment is for
     alive [batch agents]                            which agents act, if the method shares rewards among agents that may leave
     ->  r_hat [batch *agents]
 
@@ -20,7 +20,7 @@ import numpy as np
 from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.decoder_state import DecoderState, decoder_rewards
 from lare_rl.credit.input_names import input_arrays
-from lare_rl.credit.methods import Method, Reward
+from lare_rl.credit.methods import Reward
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.interface import alive_mean
 from lare_rl.export.translate import add_function, finish, graph_input
@@ -35,13 +35,14 @@ from lare_rl.tasks.spec import select_sides
 __all__ = ["missing_reward_reason", "reward_graph"]
 
 
-def missing_reward_reason(method: Method) -> str | None:
-    """Return why a method's rewards cannot be exported, or None if they can be."""
+def missing_reward_reason(config: TrainConfig) -> str | None:
+    """Return why the rewards of a run's method cannot be exported, or None if they can be."""
+    method = config.method
     if not method.has_proxy_rewards:
         return f"{method.name} trains on the rewards of the environment"
     if method.reward is Reward.UNIFORM:
         return f"{method.name} takes the reward of a step from the return of its episode"
-    if method.inputs is not None and "history" in method.inputs.names:
+    if "history" in config.credit_specs[0].inputs:
         return f"{method.name} takes the reward of a step from the history of its episode"
     if method.reward is Reward.PROXY and method.decoder_kind.whole_episodes:
         return f"the decoder of {method.name} ({method.decoder}) reads whole episodes"
@@ -61,14 +62,14 @@ def reward_graph(
         LareError: the decoder has an operation that a graph cannot have.
     """
     team, spec = config.env.teams[team_index], config.credit_specs[team_index]
-    rows = () if config.team_level or team.n_agents == 1 else (team.n_agents,)
+    agent_axes = () if config.team_level or team.n_agents == 1 else (team.n_agents,)
     with building(Builder(UNLIMITED)):
-        arrays = input_arrays(spec.inputs, _StepInputs(config, rows, team_index, phi))
+        arrays = input_arrays(spec.inputs, _StepInputs(config, agent_axes, team_index, phi))
         inputs = {"inputs": concatenate(arrays, -1)}
         if bool(decoder.is_average):
-            inputs["length"] = graph_input("length", (1,) if rows else ())
-        if config.method.shared and rows and config.env.agents_leave:
-            inputs["alive"] = graph_input("alive", rows)
+            inputs["length"] = graph_input("length", (1,) if agent_axes else ())
+        if config.method.shared and agent_axes and config.env.agents_leave:
+            inputs["alive"] = graph_input("alive", agent_axes)
         return finish(r_hat=add_function(partial(_reward, decoder=decoder, spec=spec), inputs))
 
 
@@ -83,14 +84,14 @@ def _reward(arrays: dict[str, Any], decoder: DecoderState, spec: CreditSpec) -> 
 
 
 class _StepInputs(dict[str, Any]):
-    """The decoder's inputs of a step, by their names in `credit/input_names.py`; `before`, `after` and `env_action` are graph inputs.
+    """The decoder's inputs of a step, by their names in `credit/input_names.py`.
 
-    An input is added to the graph when it is first read.
+    The graph's inputs are `before`, `after` and, as `action`, what is `env_action` here. They are added when they are first read.
     """
 
-    def __init__(self, config: TrainConfig, rows: tuple[int, ...], team_index: int, phi: LatentFunction | None):
+    def __init__(self, config: TrainConfig, agent_axes: tuple[int, ...], team_index: int, phi: LatentFunction | None):
         super().__init__()
-        self.config, self.rows, self.team_index, self.phi = config, rows, team_index, phi
+        self.config, self.agent_axes, self.team_index, self.phi = config, agent_axes, team_index, phi
 
     def __missing__(self, name: str) -> Any:
         match name:
@@ -101,10 +102,14 @@ class _StepInputs(dict[str, Any]):
             case "observation" | "next_observation":
                 self[name] = self["before" if name == "observation" else "after"]
             case "env_action":
-                n_agents = self.config.env.n_agents if self.config.team_level else 1
-                self[name] = graph_input("action", (*self.rows, n_agents * self.config.env.action_size))
+                self[name] = graph_input(
+                    "action", (*self.agent_axes, self.config.credit_specs[self.team_index].action_size)
+                )
+            case "before" | "after":
+                size = self.config.credit_specs[self.team_index].observation_size
+                self[name] = graph_input(name, (*self.agent_axes, size))
             case _:
-                self[name] = graph_input(name, (*self.rows, self.config.credit_specs[0].observation_size))
+                raise KeyError(name)
         return self[name]
 
     def _action(self) -> Any:
@@ -113,17 +118,22 @@ class _StepInputs(dict[str, Any]):
         if env.discrete:
             return action
         agents = slice(None) if self.config.team_level else env.teams[self.team_index].agents
-        low, high = (bound[agents].reshape((*self.rows, -1)) for bound in (env.low, env.high))
+        low, high = (bound[agents].reshape((*self.agent_axes, -1)) for bound in (env.low, env.high))
         return add_function(partial(_to_network_action, low=low, high=high), {"action": action})
 
     def _factors(self) -> Any:
         """Return the factors of a step, for each agent by itself."""
         assert self.phi is not None
-        rows, factors = self.rows or (1,), []
+        rows, factors = self.agent_axes or (1,), []
+        agents, size = self.config.env.teams[self.team_index].agents, self.config.env.action_size
         for side in select_sides(self.config.scored_observation, "before", "after"):
-            inputs = (self[name].reshaped((*rows, -1), 0) for name in (side, "env_action"))
-            scores = apply_program(self.phi.source, *inputs)
-            factors.append(scores.reshaped((*self.rows, -1), None))
+            observation, action = self[side], self["env_action"]
+            if self.config.team_level:  # phi reads the actions of its own team, the decoder those of all
+                action = action[agents.start * size : agents.stop * size]
+            scores = apply_program(
+                self.phi.source, *(array.reshaped((*rows, -1), 0) for array in (observation, action))
+            )
+            factors.append(scores.reshaped((*self.agent_axes, -1), None))
         return concatenate(factors, -1)
 
 

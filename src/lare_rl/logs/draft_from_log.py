@@ -6,7 +6,18 @@ from typing import Any
 from lare_rl.assigner.space_layout import SpaceLayout
 from lare_rl.logs.open_log import open_log
 from lare_rl.new_task.documentation import single_agent_lines, split_sections, unused_titles, write_texts
-from lare_rl.new_task.draft import SCORE_LINE, Draft, count_entries, file_name, head_lines, make_draft
+from lare_rl.new_task.draft import (
+    ACTION,
+    SCORE_LINE,
+    STATE,
+    Draft,
+    count_entries,
+    describe_choice,
+    describe_shape,
+    file_name,
+    head_lines,
+    make_draft,
+)
 from lare_rl.tasks.spec import NO_ENVIRONMENT
 
 __all__ = ["draft_log_task"]
@@ -15,8 +26,8 @@ ENVIRONMENT_LINE = (
     '# environment: "none", because there are only logs. To train, write the id of the environment that they come from.'
 )
 LOG_LIMIT_LINE = (
-    "# max_episode_steps = 1000 # the time limit, if there is one: shorter episodes that did not terminate then count as cut, and "
-    "nothing is learned from them"
+    "# max_episode_steps = 1000 # the time limit, if there is one. If the log has flags, shorter episodes that did not terminate then "
+    "count as cut, and nothing is learned from them"
 )
 
 
@@ -42,8 +53,8 @@ def draft_log_task(source: Any) -> Draft:
         f"max_episode_steps = {limit}" if limit else LOG_LIMIT_LINE,
     ]
     space_descriptions = {
-        "observation": _describe(layout.observation, "the number of the state"),
-        "action": _describe(layout.action, "the action that is taken"),
+        "observation": _describe(layout.observation, STATE),
+        "action": _describe(layout.action, ACTION),
     }
     return make_draft(name, lines, texts, space_descriptions, logs_only=True)
 
@@ -53,12 +64,14 @@ def _describe(layout: SpaceLayout, choice: str) -> str:
     n_entries = count_entries(layout.size)
     match layout.kind:
         case "choices" if layout.shape:
-            return f"{n_entries}: one-hot rows of {', '.join(map(str, layout.choices))} options, one behind the other."
+            options = (
+                f"{n} options from number {first}" for n, first in zip(layout.choices, layout.first, strict=True)
+            )
+            return f"{n_entries}: a one-hot row for each choice, one behind the other: {', then '.join(options)}."
         case "choices":
-            first = f" (entry 0 is number {layout.first[0]})" if layout.first[0] else ""
-            return f"{n_entries}, all 0 but one: {choice}{first}."
+            return f"{n_entries}{describe_choice(choice, layout.first[0])}."
         case "dict" | "tuple":
             names = layout.names or [f"item {i}" for i in range(len(layout.inner))]
             inner = ", then ".join(f"{space.size} of {name}" for name, space in zip(names, layout.inner, strict=True))
             return f"{n_entries}: {inner}."
-    return f"{n_entries}{f', an array of shape {layout.shape} row by row' if len(layout.shape) > 1 else ''}."
+    return f"{n_entries}{describe_shape(layout.shape)}."

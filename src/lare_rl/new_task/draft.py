@@ -12,15 +12,19 @@ from lare_rl.tasks.spec import FILL_IN
 from lare_rl.util.sanitize import one_line
 
 __all__ = [
+    "ACTION",
     "DEFAULT_LIMIT",
     "GROUP_LINE",
     "LIMIT_LINE",
     "MEASURES_LINE",
     "SCORE_LINE",
+    "STATE",
     "Draft",
     "count_entries",
     "describe_action",
+    "describe_choice",
     "describe_flattening",
+    "describe_shape",
     "file_name",
     "head_lines",
     "make_draft",
@@ -39,6 +43,9 @@ GROUP_LINE = (
     '# group = "level" # only if episodes belong to levels, maps or weathers: the key of the last step\'s info with its number, from '
     "0 to 63"
 )
+
+STATE, ACTION = "the number of the state", "the action that is taken"
+"""The meanings of one-hot rows."""
 
 DEFAULT_LIMIT = 1000
 LIMIT_LINE = (
@@ -137,20 +144,29 @@ def count_entries(count: int) -> str:
     return "1 entry" if count == 1 else f"{count} entries"
 
 
+def describe_choice(choice: str, first: int) -> str:
+    """Return what a one-hot row means, as the end of a sentence about its entries. `first` is the number of its entry 0."""
+    return f", all 0 but one: {choice}" + (f" (entry 0 is number {first})" if first else "")
+
+
+def describe_shape(shape: tuple[int, ...]) -> str:
+    """Return how an array was flattened, as the end of a sentence about its entries."""
+    return f", an array of shape {shape} row by row" if len(shape) > 1 else ""
+
+
 def describe_flattening(space: gymnasium.Space) -> str:
     """Return how an observation was flattened, as the end of a sentence about its entries."""
     if isinstance(space, Discrete):
-        return ", all 0 but one: the number of the state"
+        return describe_choice(STATE, int(space.start))
     if not isinstance(space, Box):
         return f", {space} one part behind the other"
-    return f", an array of shape {space.shape} row by row" if len(space.shape) > 1 else ""
+    return describe_shape(space.shape)
 
 
 def describe_action(space: gymnasium.Space) -> str:
     """Return the encoding or the common bounds of an action, as the end of a sentence about its entries."""
     if isinstance(space, Discrete):
-        first = f" (entry 0 is action {space.start})" if space.start else ""
-        return f", all 0 but one: the action that is taken{first}"
+        return describe_choice(ACTION, int(space.start))
     assert isinstance(space, Box)
     lows, highs = set(map(float, space.low.ravel())), set(map(float, space.high.ravel()))
     prefix = "each " if space.shape != (1,) else ""
