@@ -43,7 +43,7 @@ def updates(
     def update(credit: DecoderState, sample: CreditSample) -> tuple[DecoderState, None]:
         features = decoder_inputs(replay.read(stored_replay, sample.steps), config, 0)
         chosen = sample.episodes
-        episodes = CreditBatch(features, sample.episode, chosen.length, chosen.mean_reward[..., 0], chosen.mask)
+        episodes = CreditBatch(features, sample.episode_index, chosen.length, chosen.mean_reward[..., 0], chosen.mask)
         return descent.update(credit, episodes, key, spec)[0], None
 
     n_steps = min(config.credit.sampled_steps, config.env.max_steps)

@@ -104,7 +104,7 @@ def test_segments_match_slow_twin(rule, data):
     for i, (payment, _, paid_for) in enumerate(expected):
         assert sample.episodes.length[i] == len(paid_for)
         np.testing.assert_allclose(sample.episodes.mean_reward[i] * len(paid_for), payment, rtol=1e-5)
-        assert observation[sample.episode == i].tolist() == [step[0] for step in paid_for]
+        assert observation[sample.episode_index == i].tolist() == [step[0] for step in paid_for]
 
 
 def test_abandon_running_and_its_payments():

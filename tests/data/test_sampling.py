@@ -80,8 +80,8 @@ def assert_packed(sample, expected):
     slots = [slot for slot, first in enumerate(expected) for _ in range(FIRST[first][0])]
     assert pairs(sample.steps)[: len(rows)] == rows
     assert set(pairs(sample.steps)) <= set(TRANSITIONS)
-    padding = len(sample.episode) - len(rows)
-    assert sample.episode.tolist() == slots + [len(sample.episodes.mask)] * padding
+    padding = len(sample.episode_index) - len(rows)
+    assert sample.episode_index.tolist() == slots + [len(sample.episodes.mask)] * padding
 
 
 @pytest.mark.parametrize(("steps", "rows"), [(60, 60), (5, LONGEST)])
@@ -92,7 +92,7 @@ def test_sample_packed(buffer, steps, rows):
     counts = []
     for i in range(24):
         sample = jax.tree.map(lambda leaf, i=i: leaf[i], samples)
-        assert len(sample.episode) == rows
+        assert len(sample.episode_index) == rows
         firsts = pairs(sample.episodes.first)[:requested]
         n_fits = int((np.cumsum([FIRST[first][0] for first in firsts]) <= rows).sum())
         assert_packed(sample, firsts[:n_fits])
@@ -132,10 +132,10 @@ def test_sample_steps_and_padded_episodes(buffer):
         assert set(sampled) <= {(env, first + t) for t in range(length)}
         assert len(set(sampled)) == min(length, 4)
         # An episode of three steps has three rows; its fourth row is padding.
-        slots = sample.episode.reshape(42, 4)[i]
+        slots = sample.episode_index.reshape(42, 4)[i]
         assert slots.tolist() == [i % 6] * min(length, 4) + [6] * (4 - min(length, 4))
     sample = sample_padded(buffer, jax.random.key(0), 5, 8, LONGEST)
     firsts = pairs(sample.episodes.first)
     expected = [(env, first + min(t, FIRST[env, first][0] - 1)) for env, first in firsts for t in range(LONGEST)]
     assert pairs(sample.steps) == expected
-    np.testing.assert_array_equal(sample.episode, np.tile(np.repeat(np.arange(8), LONGEST), (5, 1)))
+    np.testing.assert_array_equal(sample.episode_index, np.tile(np.repeat(np.arange(8), LONGEST), (5, 1)))

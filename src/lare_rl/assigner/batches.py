@@ -33,7 +33,7 @@ def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, lo
     if plan.layout == "padded":
         return _gather(store, episodes, lay_out_padded(length, plan.rows), len(episodes))
     key = jax.random.key(int(random.integers(2**31)))
-    step = np.asarray(compiled.sample_steps(key, length.astype(np.int32), steps=plan.rows))
+    step = np.asarray(compiled.sample_step_numbers(key, length.astype(np.int32), steps=plan.rows))
     return _gather(store, episodes, lay_out_sampled(length, step), len(episodes))
 
 
@@ -47,11 +47,11 @@ def whole_episodes(store: Store, spec: CreditSpec, episodes: Sequence[StoredEpis
     return pack_in_order(store, episodes, spec.window, rows)
 
 
-def pack_in_order(store: Store, episodes: Sequence[StoredEpisode], n_slots: int, rows: int) -> Iterator[CreditBatch]:
-    """Yield whole episodes in their order, in batches of at most `n_slots` episodes in `rows` rows, which the longest must fit."""
+def pack_in_order(store: Store, episodes: Sequence[StoredEpisode], n_episodes: int, rows: int) -> Iterator[CreditBatch]:
+    """Yield whole episodes in their order, in batches of at most `n_episodes` episodes in `rows` rows, which the longest must fit."""
     start = 0
     while start < len(episodes):
-        batch = _pack(store, episodes[start : start + n_slots], n_slots, rows)
+        batch = _pack(store, episodes[start : start + n_episodes], n_episodes, rows)
         yield batch
         start += int(batch.mask.sum())
 
@@ -64,31 +64,33 @@ def _lengths(episodes: Sequence[StoredEpisode]) -> Int[np.ndarray, " episodes"]:
     return np.array([len(episode.step_ids) for episode in episodes], int)
 
 
-def _pack(store: Store, episodes: Sequence[StoredEpisode], n_slots: int, rows: int) -> CreditBatch:
+def _pack(store: Store, episodes: Sequence[StoredEpisode], n_episodes: int, rows: int) -> CreditBatch:
     """Put whole episodes one after the other. Episodes that do not fit into the rows are left out."""
     length = _lengths(episodes)
     layout, mask = lay_out_packed(length, np.ones(len(length)), rows)
     episodes = episodes[: int(mask.sum())]
-    is_step = layout.slot < len(episodes)
-    return _gather(store, episodes, Layout(np.where(is_step, layout.slot, n_slots), layout.step), n_slots)
+    is_step = layout.episode_index < len(episodes)
+    return _gather(
+        store, episodes, Layout(np.where(is_step, layout.episode_index, n_episodes), layout.step), n_episodes
+    )
 
 
-def _gather(store: Store, episodes: Sequence[StoredEpisode], layout: Layout, n_slots: int) -> CreditBatch:
-    """Return the inputs of the steps of a layout, with the returns of their episodes. The batch has room for `n_slots` episodes.
+def _gather(store: Store, episodes: Sequence[StoredEpisode], layout: Layout, n_episodes: int) -> CreditBatch:
+    """Return the inputs of the steps of a layout, with the returns of their episodes. The batch has room for `n_episodes` episodes.
 
     The layout has an axis of episodes, or none. Its padding reads some stored step.
     """
     count, lengths = len(episodes), _lengths(episodes)
     first = np.cumsum(lengths) - lengths
-    slot = np.arange(count)[:, None] if layout.slot.ndim > 1 else np.minimum(layout.slot, count - 1)
-    steps = np.concatenate([episode.step_ids for episode in episodes])[first[slot] + layout.step].ravel()
-    rows, mask = steps % store.capacity, np.arange(n_slots) < count
-    length = np.where(mask, pad_rows(lengths, n_slots), 1).astype(np.int32)
-    score = pad_rows(np.array([episode.return_ for episode in episodes]), n_slots)
-    level = pad_rows(np.array([episode.level for episode in episodes], np.int32), n_slots)
+    index = np.arange(count)[:, None] if layout.episode_index.ndim > 1 else np.minimum(layout.episode_index, count - 1)
+    steps = np.concatenate([episode.step_ids for episode in episodes])[first[index] + layout.step].ravel()
+    rows, mask = steps % store.capacity, np.arange(n_episodes) < count
+    length = np.where(mask, pad_rows(lengths, n_episodes), 1).astype(np.int32)
+    score = pad_rows(np.array([episode.return_ for episode in episodes]), n_episodes)
+    level = pad_rows(np.array([episode.level for episode in episodes], np.int32), n_episodes)
     arrays: dict[str, Any] = {
         "inputs": store.inputs[rows],
-        "episode_index": layout.slot.ravel().astype(np.int32),
+        "episode_index": layout.episode_index.ravel().astype(np.int32),
         "length": length,
         "mean_reward": (score / length).astype(np.float32),
         "mask": mask.astype(np.float32),

@@ -34,7 +34,7 @@ reset_statistics = jax.jit(closed_form.reset_statistics)
 init_explanation = jax.jit(explanation.init_explanation, static_argnames="basis")
 add_to_explanation = jax.jit(explanation.add_to_explanation)
 explain = jax.jit(explanation.explain)
-sample_steps = jax.jit(layouts.sample_steps, static_argnames="steps")
+sample_step_numbers = jax.jit(layouts.sample_step_numbers, static_argnames="steps")
 
 
 @partial(jax.jit, static_argnames="spec")

@@ -24,7 +24,7 @@ def next_history(
     history: Float[AnyArray, "*batch 3 entries"], entries: Float[AnyArray, "*batch entries"]
 ) -> Float[AnyArray, "*batch 3 entries"]:
     """Return the history after a step: largest, smallest and last values. The arrays are of NumPy or of JAX."""
-    xp = jnp if isinstance(entries, jax.Array) else np
+    xp = entries.__array_namespace__()
     # fmax and fmin ignore NaN.
     return xp.stack([xp.fmax(history[..., 0, :], entries), xp.fmin(history[..., 1, :], entries), entries], axis=-2)
 

@@ -294,6 +294,11 @@ def payment_start(replay: Replay, env: Int[Array, "*batch"], episode: Int[Array,
     return jnp.where(episode < replay.current_episode[env], look_up(replay.first_paid, env, episode), first)
 
 
+def read_newest(replay: Replay, steps: int) -> StoredSteps:
+    """Read the last steps of every environment: [envs steps ...]."""
+    return read(replay, newest_steps(replay, steps))
+
+
 def newest_steps(replay: Replay, steps: int) -> Index:
     """Return the index of the last steps of every environment: [envs steps].
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
-from lare_rl.data.layouts import Layout, lay_out_packed, lay_out_padded, lay_out_sampled, sample_steps
+from lare_rl.data.layouts import Layout, lay_out_packed, lay_out_padded, lay_out_sampled, locate, sample_step_numbers
 from lare_rl.data.replay import (
     Index,
     Replay,
@@ -57,7 +57,7 @@ class CreditSample(NamedTuple):
 
     steps: Index
     """[*updates rows]."""
-    episode: Int[Array, "*updates rows"]
+    episode_index: Int[Array, "*updates rows"]
     """Which of `episodes` each row belongs to. Padding has the number of episodes, an index out of range."""
     episodes: EpisodeSample
 
@@ -106,7 +106,7 @@ def sample_episode_steps(
     """Sample some steps of each of `count` episodes, for RRD."""
     episodes_key, steps_key = jax.random.split(key)
     episodes = sample_episodes(replay, episodes_key, (updates, count))
-    layout = lay_out_sampled(episodes.length, sample_steps(steps_key, episodes.length, steps_per_episode))
+    layout = lay_out_sampled(episodes.length, sample_step_numbers(steps_key, episodes.length, steps_per_episode))
     return _credit_sample(episodes, layout)
 
 
@@ -149,36 +149,32 @@ def episodes_in_order(
     """
     counts = count_episodes_since(replay, since)
     position = start + jnp.arange(count)
-    env, number = _locate(counts, position)
+    env, number = locate(counts, position)
     episodes = get_episodes(replay, Index(env, number + jnp.maximum(since - replay.oldest, 0)[env]))
     return _pack(episodes._replace(mask=episodes.mask * (position < jnp.sum(counts))), rows)
 
 
 def _sample_items(counts: Int[Array, " envs"], key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
     """Sample uniformly from the items of all environments. `number` counts from 0 in each environment."""
-    return _locate(counts, jax.random.randint(key, shape, 0, jnp.maximum(jnp.sum(counts), 1)))
-
-
-def _locate(counts: Int[Array, " envs"], position: Int[Array, "*batch"]) -> Index:
-    """Return the items at these positions of a row of all items, one environment after the other."""
-    ends = jnp.cumsum(counts)
-    env = jnp.minimum(jnp.searchsorted(ends, position, side="right"), len(counts) - 1)
-    return Index(env, position - (ends - counts)[env])
+    return Index(*locate(counts, jax.random.randint(key, shape, 0, jnp.maximum(jnp.sum(counts), 1))))
 
 
 def _credit_sample(episodes: EpisodeSample, layout: Layout) -> CreditSample:
     """Return the sample with this layout, which has the same number of rows for each episode."""
     lead = episodes.length.shape[:-1]
-    steps, slot = jax.tree.map(lambda rows: rows.reshape(*lead, -1), (episodes.steps(layout.step), layout.slot))
-    return CreditSample(steps, slot, episodes)
+    rows = episodes.steps(layout.step), layout.episode_index
+    steps, episode_index = jax.tree.map(lambda array: array.reshape(*lead, -1), rows)
+    return CreditSample(steps, episode_index, episodes)
 
 
 def _pack(episodes: EpisodeSample, rows: int) -> CreditSample:
     """Put whole episodes one after the other. Episodes that do not fit into the rows are left out."""
     layout, mask = lay_out_packed(episodes.length, episodes.mask, rows)
-    slot = jnp.where(layout.slot < len(mask), layout.slot, 0)  # padding reads a step that is certainly stored
-    steps = Index(episodes.first.env[slot], episodes.first.number[slot] + layout.step)
-    return CreditSample(steps, layout.slot, episodes._replace(mask=mask))
+    index = jnp.where(
+        layout.episode_index < len(mask), layout.episode_index, 0
+    )  # padding reads a step that is certainly stored
+    steps = Index(episodes.first.env[index], episodes.first.number[index] + layout.step)
+    return CreditSample(steps, layout.episode_index, episodes._replace(mask=mask))
 
 
 def _n_finished_steps(replay: Replay) -> Int[Scalar, ""]:

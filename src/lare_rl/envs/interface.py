@@ -21,6 +21,7 @@ __all__ = [
     "Timestep",
     "alive_mean",
     "team_mean",
+    "team_means",
     "to_env_action",
     "to_package_action",
     "with_available_action",
@@ -187,6 +188,13 @@ def team_mean(
     This mean of rewards is the reward of a team for a step. The team's return R is the sum of these rewards over the episode.
     """
     return alive_mean(values[..., team.agents], alive[..., team.agents])
+
+
+def team_means(
+    values: Float[AnyArray, "*batch agents"], alive: Bool[AnyArray, "*batch agents"], spec: "EnvSpec"
+) -> Float[AnyArray, "*batch teams"]:
+    """Return `team_mean` of each team."""
+    return values.__array_namespace__().stack([team_mean(values, alive, team) for team in spec.teams], axis=-1)
 
 
 def alive_mean(

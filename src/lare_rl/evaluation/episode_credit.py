@@ -123,7 +123,7 @@ def _read_newest(learners: Learner, config: TrainConfig) -> StoredSteps:
     buffers = learners.replay
     n_stored = int(np.min(jax.jit(jax.vmap(replay.n_stored_transitions))(buffers)))
     n_steps = min(max(1, RECENT_STEPS // config.n_envs), n_stored)
-    return jax.jit(jax.vmap(lambda buffer: replay.read(buffer, replay.newest_steps(buffer, n_steps))))(buffers)
+    return jax.jit(jax.vmap(lambda buffer: replay.read_newest(buffer, n_steps)))(buffers)
 
 
 def _factor_correlations(

@@ -152,7 +152,7 @@ def compute_proxy_rewards(
         if config.is_exact:
             since = replay.segments_as_episodes(filled.replay).oldest
             filled = predict_returns(filled._replace(decoders=learner.decoders), since, config)
-        stored = replay.read(filled.replay, replay.newest_steps(filled.replay, n_steps))
+        stored = replay.read_newest(filled.replay, n_steps)
         return jnp.swapaxes(rewards(stored, learner.decoders, replace(config, scale_rewards=False)), 0, 1)
 
     return np.asarray(compute(jax.tree.map(jnp.asarray, steps), jnp.asarray(factors)))

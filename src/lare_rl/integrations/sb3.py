@@ -17,6 +17,7 @@ from gymnasium import spaces
 from jaxtyping import Float, Int
 
 from lare_rl.assigner.assigner import CreditAssigner
+from lare_rl.credit.methods import Reward
 from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.integrations.recorder import StepRecorder, check_assigner, check_capacity
 
@@ -166,7 +167,6 @@ class CreditCallback(BaseCallback):
         super().__init__(verbose)
         check_assigner(credit)
         self.credit, self.updates = credit, updates
-        self.step_ids: list[Int[np.ndarray, " environments"]] = []  # of the steps of this rollout
 
     def _on_training_start(self) -> None:
         if self.parent is not None:
@@ -184,7 +184,7 @@ class CreditCallback(BaseCallback):
         # The keys belong to the model, so that a second call of `learn` continues the running episodes.
         env_ids = [(id(self.model), env_index) for env_index in range(buffer.n_envs)]
         self._recorder = StepRecorder(self.credit, self.model.observation_space, self.model.action_space, env_ids)
-        self.step_ids = []
+        self.step_ids: list[Int[np.ndarray, " environments"]] = []  # of the steps of this rollout
         starts: Any = self.model._last_episode_starts
         for env_index in np.flatnonzero(starts).tolist():  # it was reset, or its episode has ended
             self._recorder.drop(env_index)
@@ -228,7 +228,7 @@ class CreditCallback(BaseCallback):
 
     def _record_metrics(self) -> None:
         metrics = self.credit.metrics()
-        if not metrics["credit/episodes"]:
+        if not metrics["credit/episodes"] and self.credit.config.method.reward is not Reward.DESIGNED:
             warnings.warn(
                 "no episode has ended yet, so the rewards say nothing: n_steps should hold several episodes",
                 stacklevel=3,
@@ -237,7 +237,7 @@ class CreditCallback(BaseCallback):
             self.logger.record(name, value)
 
     def _original_observation(self, observation: Any) -> Any:
-        """Return the environment's last observation, before any normalisation."""
+        """Return a copy of the last observation as it was before VecNormalize. `observation` is the one that the algorithm sees."""
         normalize = self.model.get_vec_normalize_env()
         return deepcopy(observation) if normalize is None else normalize.get_original_obs()
 

@@ -168,7 +168,7 @@ def episode_batch(steps: StoredSteps, sample: CreditSample, config: CreditConfig
     episodes = sample.episodes
     return CreditBatch(
         inputs=decoder_inputs(steps, config, team_index),
-        episode_index=sample.episode,
+        episode_index=sample.episode_index,
         length=episodes.length,
         mean_reward=episodes.mean_reward[..., team_index],
         mask=episodes.mask,

@@ -21,7 +21,7 @@ from lare_rl.data import replay
 from lare_rl.data.extend import abandon_running, extend, set_newest
 from lare_rl.data.replay import STEP_COLUMNS, Replay, StoredSteps
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.interface import team_mean
+from lare_rl.envs.interface import team_means
 from lare_rl.phi.graph import Graph
 from lare_rl.tasks.spec import MAX_LEVELS
 from lare_rl.training.decoder_inputs import compute_factors, decoder_inputs, row_mask, tracked_inputs
@@ -90,12 +90,12 @@ def store_with_factors(
     Where `scored` is false, the decoders do not read the step of an agent, but its reward counts.
     """
     columns, next_columns = replay_columns(steps, factors, config, scored)
-    rewards = [team_mean(steps.next_timestep.reward, steps.timestep.alive, team) for team in config.env.teams]
-    team_reward, level = jnp.stack(rewards, axis=-1), _levels(steps, config)
+    team_reward = team_means(steps.next_timestep.reward, steps.timestep.alive, config.env)
+    level = _levels(steps, config)
     buffer = extend(learner.replay, columns, next_columns, team_reward, steps.ended, config.payments, level)
     if config.n_tracked:
         buffer = _with_history(learner.replay, buffer, len(steps.ended), config)
-    new_steps = replay.read(buffer, replay.newest_steps(buffer, len(steps.ended)))
+    new_steps = replay.read_newest(buffer, len(steps.ended))
     new_steps = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), new_steps)
     decoders = tuple(_observe(decoder, new_steps, config, i) for i, decoder in enumerate(learner.decoders))
     return learner._replace(decoders=decoders, replay=buffer)
@@ -103,12 +103,12 @@ def store_with_factors(
 
 def _with_history(before: Replay, buffer: Replay, n_steps: int, config: CreditConfig) -> Replay:
     """Return the replay with the history of its newest steps. `before` is the replay without them."""
-    last_step = replay.read(before, replay.newest_steps(before, 1))
-    new_steps = replay.read(buffer, replay.newest_steps(buffer, n_steps))
-    first = jnp.append(~replay.segments_as_episodes(before).running[:, None], new_steps.last[:, :-1], axis=1)
+    last_step = replay.read_newest(before, 1)
+    new_steps = replay.read_newest(buffer, n_steps)
+    begins = jnp.append(~replay.segments_as_episodes(before).running[:, None], new_steps.last[:, :-1], axis=1)
     last_history = next_history(last_step.columns["history"][:, 0], tracked_inputs(last_step, config)[:, 0])
     entries = jnp.swapaxes(tracked_inputs(new_steps, config), 0, 1)
-    history = scan_history(last_history, entries, jnp.broadcast_to(first.T[..., None], entries.shape[:-1]))
+    history = scan_history(last_history, entries, jnp.broadcast_to(begins.T[..., None], entries.shape[:-1]))
     return set_newest(buffer, "history", history)
 
 

@@ -38,7 +38,7 @@ def _predict_newest_returns(learner: Learner, config: TrainConfig) -> Learner:
 def _rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> Rollout:
     """Return the newest steps with the method's rewards. Each agent of each environment is one actor of the rollout."""
     learner = _predict_newest_returns(learner, config) if config.is_exact else learner
-    stored = replay.read(learner.replay, replay.newest_steps(learner.replay, config.rollout_steps))
+    stored = replay.read_newest(learner.replay, config.rollout_steps)
     reward = rewards(stored, learner.decoders, config)  # [envs time agents]
     n_agents, agents_leave = config.env.n_agents, config.env.agents_leave
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from lare_rl.config.train_config import TrainConfig
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.env_errors import EnvOutputError, name_step
-from lare_rl.envs.interface import Timestep, team_mean, to_env_action
+from lare_rl.envs.interface import Timestep, team_means, to_env_action
 from lare_rl.envs.play import EpisodeListener
 from lare_rl.envs.vec_env import VecEnv
 from lare_rl.training.divergence import check_actions
@@ -104,7 +104,7 @@ def evaluate_batch_on_host(
             on_step()
             timestep, next_timestep = step.timestep, step.next_timestep
             reward = next_timestep.reward.astype(np.float64) * running[..., None]
-            returns += np.stack([team_mean(reward, timestep.alive, team) for team in spec.teams], axis=-1)
+            returns += team_means(reward, timestep.alive, spec)
             summed_returns += np.stack([reward[..., team.agents].sum(axis=-1) for team in spec.teams], axis=-1)
             lengths += running
             ended = running & step.ended
