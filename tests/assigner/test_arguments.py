@@ -9,6 +9,7 @@ from helpers.assigner_episodes import small_assigner
 from lare_rl.assigner.arguments import read_steps, to_levels, to_rows, to_score, to_step_ids
 from lare_rl.assigner.group_names import to_group_name
 from lare_rl.errors import LareError
+from lare_rl.tasks.payments import PaymentRule
 
 
 def read(reward, *, agents=None, env_ids=None, alive=None):
@@ -67,6 +68,11 @@ def test_arguments_are_refused(call, message):
 
 def test_score_may_have_axes():
     assert to_score(np.array([[2.0]]), "the score") == 2.0
+
+
+def test_group_is_needed_only_when_paid():
+    config = small_assigner(groups=True, payments=PaymentRule(window=3)).config  # paid once, for the last steps
+    assert to_levels(config, [None, "rain"], read(ROWS), {}).tolist() == [-1, 0]
 
 
 def test_group_may_be_an_array():

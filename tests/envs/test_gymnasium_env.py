@@ -194,6 +194,17 @@ def test_invalid_value_or_failure(kwargs, content):
     assert isinstance(error.value, EnvOutputError) == content.startswith(("observation", "reward"))
 
 
+def test_group_is_needed_at_each_step_if_the_environment_pays_early():
+    for payments in ("end", 1):
+        task = toy_spec(environment="foreign/Invalid-v0", group="level", payments=payments)
+        env = GymnasiumEnv(task, info={})
+        env.reset(0)
+        with (
+            contextlib.nullcontext() if payments == "end" else pytest.raises(LareError, match="group 'level'.*is empty")
+        ):
+            env.step(STILL)
+
+
 @pytest.mark.filterwarnings("ignore:.*render_mode")
 def test_render():
     with contextlib.closing(GymnasiumEnv(toy_spec(environment="FrozenLake-v1"), render_mode="ansi")) as env:

@@ -4,6 +4,7 @@ from importlib.util import find_spec
 
 import gymnasium
 import pytest
+from gymnasium.wrappers import RescaleAction
 
 from helpers.long_tests import long_case
 from helpers.toy_envs import Chase, toy_spec
@@ -147,6 +148,7 @@ def test_like_cycle(tmp_path, circle):
 
 
 gymnasium.register("toys/LongChase-v0", entry_point=Chase, max_episode_steps=30)
+gymnasium.register("toys/WideChase-v0", lambda **_: RescaleAction(Chase(), -9, 9), max_episode_steps=20)
 
 
 def test_evaluation_environment():
@@ -155,6 +157,8 @@ def test_evaluation_environment():
     assert task.evaluation_task == toy_spec(environment="toys/LongChase-v0")
     assert load_env_spec(task.evaluation_task).max_steps == 30
     assert toy_spec().evaluation_task == toy_spec()
+    with pytest.raises(LareError, match="bounds of actions"):
+        check_environment(toy_spec(evaluation_environment="toys/WideChase-v0"))
     task = read_task("CN-6").model_copy(update={"evaluation_environment": "particles/CN-6"})
     with pytest.raises(LareError, match="evaluation_environment has no effect on particles/CN-6"):
         load_env_spec(task)

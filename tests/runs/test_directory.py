@@ -72,7 +72,10 @@ def test_metrics_that_cannot_be_truncated(tmp_path):
 
 
 def test_metrics_have_a_meaning_and_the_lock_refuses_a_second_process(run):
-    metric, files = r'"((?:algorithm|evaluation|credit|critic|actor|time)/\w+)"', Path(lare_rl.__file__).parent.rglob("*.py")
+    metric, files = (
+        r'"((?:algorithm|evaluation|credit|critic|actor|time)/\w+)"',
+        Path(lare_rl.__file__).parent.rglob("*.py"),
+    )
     names = {name for path in files for name in re.findall(metric, path.read_text(encoding="utf-8"))}
     documented = {name for group in METRIC_GROUPS.values() for name in group}
     assert names - {"evaluation/won"} == documented - {"step", "seed"}  # tasks name their own measures

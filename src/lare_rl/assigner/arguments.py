@@ -147,7 +147,7 @@ def to_levels(
     if len(numbers) > MAX_LEVELS:
         raise LareError(f"there are more than {MAX_LEVELS} groups, such as {list(numbers)[-1]!r}: merge some of them")
     level = np.array([-1 if name is None else numbers[name] for name in names], np.int32)
-    if np.any((level < 0) & (new.ended | (not config.payments.only_at_end))):
+    if np.any((level < 0) & (new.ended | config.payments.pays_early)):
         raise LareError("the group of an episode is None when it is paid: give the group of each row that is paid")
     group_names |= numbers
     return level

@@ -78,6 +78,10 @@ def check_training(config: CreditConfig) -> None:
         raise LareError(
             f"{method.name} reads whole episodes: rollout_steps = {rollout_steps} is not a multiple of their length, {max_steps}"
         )
+    if config.is_exact and len(config.env.teams) > 1 and config.env.agents_leave:
+        raise LareError(
+            "exact adds to the rewards of an episode's last step, at which a team of several may have left: use exact = 'no'"
+        )
     if config.consumes is not Consumes.ROLLOUTS and method.uses_gradient and config.credit.exact != "no":
         raise LareError(
             "exact needs proxy rewards that stay the same during an iteration, and the updates of an off-policy algorithm change "

@@ -17,6 +17,7 @@ __all__ = [
     "EnvOutputError",
     "as_lare_error",
     "check_finite",
+    "check_group",
     "close_env",
     "convert_output",
     "import_hint",
@@ -136,17 +137,24 @@ def read_measures(
 ) -> dict[str, Float[np.ndarray, ""]]:
     """Return the measures and the group of the task from each agent's `info`: the means over the agents that report them.
 
-    Before the last step, measures are 0, and so is a group that no agent reports. Raises `LareError` if a value of the last step is
-    missing or not a number, or if the group of any step is not valid.
+    Before the last step, measures are 0, and so is a group that no agent reports if the environment pays only at the end. Raises
+    `LareError` if a value that is needed is missing or not a number, or if the group of any step is not valid.
     """
     measures = {}
     for name in task.info_keys:
-        is_read = last or (name == task.group and any(name in info for info in infos))
-        value = _read_measure(infos, name) if is_read else 0
-        if name == task.group and value not in range(MAX_LEVELS):
-            raise LareError(f"the group {name!r} in info is {value:g}, not a whole number from 0 to {MAX_LEVELS - 1}")
+        may_be_paid = task.payment_rule.pays_early or any(name in info for info in infos)
+        is_read = last or (name == task.group and may_be_paid)
+        value = _read_measure(infos, name) if is_read else 0.0
+        if name == task.group:
+            check_group(value, name)
         measures[name] = np.array(value, np.float32)
     return measures
+
+
+def check_group(value: float, name: str) -> None:
+    """Raise `LareError` if the value of a task's group is not valid."""
+    if value not in range(MAX_LEVELS):
+        raise LareError(f"the group {name!r} in info is {value:g}, not a whole number from 0 to {MAX_LEVELS - 1}")
 
 
 def _read_measure(infos: Sequence[Mapping[Any, Any]], name: str) -> float:
@@ -157,5 +165,5 @@ def _read_measure(infos: Sequence[Mapping[Any, Any]], name: str) -> float:
     if not values:
         keys = ", ".join(sorted({str(key) for info in infos for key in info}))
         content = f"has only {keys}" if keys else "is empty (was the episode cut at max_episode_steps?)"
-        raise LareError(f"the task has the measure or group {name!r}, but the last step's info {content}")
+        raise LareError(f"the task has the measure or group {name!r}, but info {content}")
     return float(np.mean(values))

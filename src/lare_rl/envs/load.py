@@ -64,7 +64,10 @@ def read_task(task: str | Path) -> TaskSpec:
 
 def check_environment(spec: TaskSpec) -> None:
     """Make the environment and compare it with the task. Raises `LareError` at the first mismatch."""
-    from lare_rl.envs.families import check_logs  # imports NumPy, which listing tasks does not need
+    # These import NumPy, which listing tasks does not need.
+    import numpy as np
+
+    from lare_rl.envs.families import check_logs
     from lare_rl.envs.placement import load_env_spec
 
     if spec.environment == NO_ENVIRONMENT:
@@ -79,6 +82,12 @@ def check_environment(spec: TaskSpec) -> None:
         if sizes[0] != sizes[1]:
             raise LareError(
                 f"task {spec.name!r}: {name} is {sizes[0]} in {spec.environment}, and {sizes[1]} in {spec.evaluation_environment}: both "
+                "need the same"
+            )
+    for name in ("low", "high"):
+        if not np.array_equal(getattr(env, name), getattr(other, name)):
+            raise LareError(
+                f"task {spec.name!r}: the bounds of actions in {spec.environment} and {spec.evaluation_environment} differ: both "
                 "need the same"
             )
 

@@ -84,7 +84,8 @@ class ParallelHost:
             masks_actions=self._masks_actions,
             measures=task.info_keys,
             agent_names=tuple(map(str, names)),
-            entry_meanings={} if task.teams else entry_meanings(task.observation),  # each team has texts of its own
+            # Each team has texts of its own, and with credit_scope = "state" the text describes the state.
+            entry_meanings={} if task.teams or task.credit_scope == "state" else entry_meanings(task.observation),
         )
 
     def reset(self, seed: int) -> Timestep:

@@ -19,6 +19,7 @@ from lare_rl.data.sampling import get_episodes
 from lare_rl.envs.interface import team_mean
 from lare_rl.runs.directory import Run
 from lare_rl.training.decoder_inputs import alive_agents, decoder_inputs
+from lare_rl.training.episodes import predict_returns
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import has_step_rewards, rewards
 from lare_rl.training.saved_state import load_learner
@@ -78,6 +79,10 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
 
     @jax.jit
     def read_rewards(learner: Learner, index: Index) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
+        if config.is_exact:  # a checkpoint may hold no predictions, or old ones
+            oldest = replay.segments_as_episodes(learner.replay).oldest
+            with float64():
+                learner = predict_returns(learner, oldest, config)
         steps = replay.read(learner.replay, index)
         return steps, rewards(steps, learner.decoders, replace(config, scale_rewards=False))
 

@@ -118,9 +118,12 @@ def evaluate_policy(
         return evaluate_policy_on_host(envs, config, actor, run.seeds, episodes, first, on_episode=on_episode)
 
 
-def evaluation_seeds(run: Run, episodes: int) -> list[int]:
-    """Return the seeds with which `evaluate_policy` resets an environment on the host, of all episodes of all seeds of the run."""
-    first = run.config.settings.evaluation_episodes
+def evaluation_seeds(run: Run, episodes: int, *, in_training: bool = False) -> list[int]:
+    """Return the seeds with which `evaluate_policy` resets an environment on the host, of all episodes of all seeds of the run.
+
+    `in_training` means the evaluations during training, which play other episodes.
+    """
+    first = 0 if in_training else run.config.settings.evaluation_episodes
     numbers = range(first, first + episodes)
     return [episode_seed(seed, Stream.EVALUATION_EPISODES, number) for number in numbers for seed in run.seeds]
 
@@ -149,10 +152,13 @@ def mean_with_error(values: Float[np.ndarray, "seeds episodes"]) -> tuple[float,
     return float(values.mean()), grouped_standard_error(values.mean(axis=1), error)
 
 
-def measure_random_returns(task: TaskSpec, n_episodes: int = RANDOM_EPISODES) -> Float[np.ndarray, "teams episodes"]:
+def measure_random_returns(
+    task: TaskSpec, n_episodes: int = RANDOM_EPISODES, seeds: Sequence[int] = ()
+) -> Float[np.ndarray, "teams episodes"]:
     """Return the returns of `play_random`, with a time limit in proportion to the number of episodes."""
     limit_s = RANDOM_PLAY_LIMIT_S * n_episodes / RANDOM_EPISODES
-    return np.array([[episode.return_ for episode in episodes] for episodes in play_random(task, n_episodes, limit_s)])
+    by_role = play_random(task, n_episodes, limit_s, seeds=seeds)
+    return np.array([[episode.return_ for episode in episodes] for episodes in by_role])
 
 
 def n_random_episodes(run_steps: int, longest_episode: int) -> int:

@@ -200,7 +200,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
 
 def _check_score(credit: CreditAssigner, score: str | None) -> None:
     """Raise `LareError` if the score of an episode would be taken for its last payment."""
-    if score is not None and not credit.config.payments.only_at_end:
+    if score is not None and credit.config.payments.pays_early:
         raise LareError(
             f"score = {score!r} is the score of an episode, and the assigner was made for payments before the end"
         )

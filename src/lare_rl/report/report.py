@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 
 from lare_rl.errors import LareError
-from lare_rl.evaluation.evaluate import measure_random_returns, n_random_episodes
+from lare_rl.evaluation.evaluate import evaluation_seeds, measure_random_returns, n_random_episodes
 from lare_rl.evaluation.video import encode_film, record_frames
 from lare_rl.report.html import render_film, render_fold, render_note, write_page
 from lare_rl.report.overview import (
@@ -29,6 +29,7 @@ from lare_rl.tasks.spec import check_same_tasks
 from lare_rl.tasks.trust import untrusted_module
 from lare_rl.util.files import check_new_path, write_bytes
 from lare_rl.util.provenance import code_version
+from lare_rl.util.rounding import round_up
 
 __all__ = ["default_path", "write_report"]
 
@@ -117,7 +118,12 @@ def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
     check_same_tasks((reported.run.directory, reported.run.config.task) for reported in runs)
     task = runs[0].run.config.task
     n_random = max(n_random_episodes(reported.last_step, reported.run.config.longest_episode) for reported in runs)
-    random_returns = measure_random_returns(task, n_random)
+    seeds: list[int] = []
+    if task.group is not None:  # those of the evaluations, because groups may differ in their returns
+        run = runs[0].run
+        seeds = evaluation_seeds(run, run.config.settings.evaluation_episodes, in_training=True)
+        n_random = round_up(n_random, len(seeds))
+    random_returns = measure_random_returns(task, n_random, seeds)
     summaries = summarise_runs(runs, random_returns)
     filmed = [i for i, reported in enumerate(runs) if _can_load(reported.run)][:MAX_FILMS] if film else []
     films = {i: _load_film(runs[i].run, FILM_BYTES // len(filmed)) for i in filmed}

@@ -31,12 +31,17 @@ class PaymentRule:
         return self == PAID_AT_END
 
     @property
+    def pays_early(self) -> bool:
+        """Whether it may pay before the end of an episode."""
+        return self.nonzero or self.period is not None
+
+    @property
     def for_scores(self) -> "PaymentRule":
         """The rule for an episode of which only the score is known: it is paid once, at its end.
 
         `window` is kept only if the environment pays once, too. Otherwise it is that of earlier payments.
         """
-        return PAID_AT_END if self.nonzero or self.period is not None else self
+        return PAID_AT_END if self.pays_early else self
 
     def longest_segment(self, max_steps: int) -> int:
         """Return the largest number of steps that a payment is for, in episodes of at most `max_steps` steps."""

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from lare_rl.algorithms.registry import Noise
 from lare_rl.config.train_config import TrainConfig
 from lare_rl.data.trajectory import Trajectory
+from lare_rl.envs.env_errors import check_group
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import JaxEnv, Timestep, team_mean, to_env_action
 from lare_rl.envs.vec_env import check_jax_env, check_lengths
@@ -46,7 +47,7 @@ class DeviceCollector:
     """The environments of a run, if they are pure functions: one compiled call makes an iteration's steps."""
 
     def __init__(self, env: JaxEnv, config: TrainConfig, seeds: Sequence[int]):
-        self.env, self._seeds, self._n_devices = env, seeds, config.n_devices
+        self.env, self._seeds, self._n_devices, self._group = env, seeds, config.n_devices, config.group
         self._reset, self._collect, self._evaluate = _jit_functions(env, config)
         self.envs: VecEnvState = self._reset(stream_keys(seeds, Stream.TRAINING_EPISODES, 0))
 
@@ -64,6 +65,9 @@ class DeviceCollector:
         keys = stream_keys(self._seeds, Stream.EVALUATION_EPISODES, number)
         evaluation, ended = jax.device_get(self._evaluate(actor, keys, n_episodes=n_episodes))
         check_lengths(self.env.spec, evaluation.lengths.ravel(), ended.ravel())
+        if self._group is not None:
+            for value in np.unique(evaluation.measures[self._group]).tolist():
+                check_group(value, self._group)
         return evaluation
 
     def state_dict(self) -> dict[str, np.ndarray]:

@@ -73,7 +73,9 @@ def _find_explanations(run: Run, learner: Learner, config: TrainConfig) -> list[
     for i, explanation in enumerate(explain_stored_returns(learner, config)):
         role, spec = run.config.task.roles[i], config.credit_specs[i]
         factor_names = run.functions[i].factor_columns(run.scored_observation) if run.functions else []
-        raw_names = [] if config.team_level else fitted_specs[i].raw_feature_names(role.observation, role.action)
+        # The decoders of several teams read the actions of all, and a team's text describes only its own.
+        has_names = not config.team_level or len(config.env.teams) == 1
+        raw_names = fitted_specs[i].raw_feature_names(role.observation, role.action) if has_names else []
         decoder = select_seed(first_shard(learner.decoders[i]))
         names = factor_names, raw_names, range(spec.n_levels)
         only_at_end = run.config.task.payment_rule.only_at_end
