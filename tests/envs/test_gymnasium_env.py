@@ -195,14 +195,15 @@ def test_invalid_value_or_failure(kwargs, content):
 
 
 def test_group_is_needed_at_each_step_if_the_environment_pays_early():
-    for payments in ("end", 1):
-        task = toy_spec(environment="foreign/Invalid-v0", group="level", payments=payments)
-        env = GymnasiumEnv(task, info={})
-        env.reset(0)
-        with (
-            contextlib.nullcontext() if payments == "end" else pytest.raises(LareError, match="group 'level'.*is empty")
-        ):
-            env.step(STILL)
+    env, early = (
+        GymnasiumEnv(toy_spec(environment="foreign/Invalid-v0", group="level", payments=payments), info={})
+        for payments in ("end", 1)
+    )
+    env.reset(0)
+    assert env.step(STILL).measures == {"level": 0}
+    early.reset(0)
+    with pytest.raises(LareError, match="group 'level', but info is empty"):
+        early.step(STILL)
 
 
 @pytest.mark.filterwarnings("ignore:.*render_mode")
