@@ -133,17 +133,18 @@ def to_float(value: Any) -> float:
 
 
 def read_measures(
-    infos: Sequence[Mapping[Any, Any]], task: TaskSpec, *, last: bool
+    infos: Sequence[Mapping[Any, Any]], task: TaskSpec, *, first: bool, last: bool
 ) -> dict[str, Float[np.ndarray, ""]]:
     """Return the measures and the group of the task from each agent's `info`: the means over the agents that report them.
 
-    Before the last step, measures are 0, and so is a group that no agent reports if the environment pays only at the end. Raises
-    `LareError` if a value that is needed is missing or not a number, or if the group of any step is not valid.
+    `first` is whether this is the reset, and `last` whether the episode has ended. Before the end, measures are 0, and so is a group
+    that no agent reports, unless the environment may pay for the step. Raises `LareError` if a value that is needed is missing or not
+    a number, or if the group of any step is not valid.
     """
     measures = {}
     for name in task.info_keys:
-        may_be_paid = task.payment_rule.pays_early or any(name in info for info in infos)
-        is_read = last or (name == task.group and may_be_paid)
+        may_be_paid = task.payment_rule.pays_early and not first
+        is_read = last or (name == task.group and (may_be_paid or any(name in info for info in infos)))
         value = _read_measure(infos, name) if is_read else 0.0
         if name == task.group:
             check_group(value, name)

@@ -113,7 +113,7 @@ class GymnasiumEnv:
     def reset(self, seed: int) -> Timestep:
         with one_line_errors(f"{self._label} failed in reset"):
             observation, info = self.environment.reset(seed=seed)
-        return self._make_timestep(observation, 0.0, False, False, info)
+        return self._make_timestep(observation, 0.0, False, False, info, first=True)
 
     def step(self, action: Float[np.ndarray, "1 action"]) -> Timestep:
         with one_line_errors(f"{self._label} failed in step"):
@@ -122,7 +122,9 @@ class GymnasiumEnv:
             terminated, truncated = bool(terminated), bool(truncated)  # fails for arrays with several elements
         return self._make_timestep(observation, reward, terminated, truncated, info)
 
-    def _make_timestep(self, observation: Any, reward: Any, terminated: bool, truncated: bool, info: Any) -> Timestep:
+    def _make_timestep(
+        self, observation: Any, reward: Any, terminated: bool, truncated: bool, info: Any, *, first: bool = False
+    ) -> Timestep:
         if not isinstance(info, dict):
             raise LareError(f"{self._label} returned info {short_repr(info)}, which is not a dictionary")
         vector = convert_output(self._agent.flatten_observation, observation, f"{self._label}: the observation")
@@ -136,7 +138,7 @@ class GymnasiumEnv:
             reward=float_array([number]),
             terminated=np.bool_(terminated),
             truncated=np.bool_(truncated),
-            measures=read_measures([info], self._task, last=last),
+            measures=read_measures([info], self._task, first=first, last=last),
         )
 
     def render(self) -> Any:

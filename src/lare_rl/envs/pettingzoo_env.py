@@ -97,7 +97,9 @@ class ParallelHost:
         if not self._present.any():
             raise self._error(" has no agents after reset")
         self._alive = self._present.copy()
-        return self._make_timestep(observations, infos, np.zeros(len(self._alive)), self._alive, self._alive)
+        return self._make_timestep(
+            observations, infos, np.zeros(len(self._alive)), self._alive, self._alive, first=True
+        )
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
         acted = self._alive
@@ -183,6 +185,8 @@ class ParallelHost:
         acts: Bool[np.ndarray, " agents"],
         terminated: bool = False,
         truncated: bool = False,
+        *,
+        first: bool = False,
     ) -> Timestep:
         """Make a timestep. `observes` marks the agents that observe it, `acts` those that act next, whose masks are read."""
         vectors: dict[int, np.ndarray] = {}
@@ -213,7 +217,7 @@ class ParallelHost:
             reward=float_array(reward),
             terminated=np.array(terminated),
             truncated=np.array(truncated),
-            measures=read_measures(reports, self._task, last=last),
+            measures=read_measures(reports, self._task, first=first, last=last),
         )
 
     def _read_state(self, observation: Float[np.ndarray, "agents observation"]) -> Float[np.ndarray, " state"]:
