@@ -196,13 +196,13 @@ def test_invalid_value_or_failure(kwargs, content):
 
 def test_group_is_needed_at_each_step_if_the_environment_pays_early():
     env, early = (
-        GymnasiumEnv(toy_spec(environment="foreign/Invalid-v0", group="level", payments=payments), info={})
+        GymnasiumEnv(toy_spec(environment="foreign/Invalid-v0", group="level", payments=payments))
         for payments in ("end", 1)
     )
     env.reset(0)
     assert env.step(STILL).measures == {"level": 0}
     early.reset(0)
-    with pytest.raises(LareError, match="group 'level', but info is empty"):
+    with pytest.raises(LareError, match="group 'level', but info has only distance"):
         early.step(STILL)
 
 
