@@ -2,7 +2,7 @@
 
     python benchmarks/gap.py
 
-It reads `results/`, writes `docs/pictures/gap.svg` and prints the first two tables of `docs/results/README.md`. The share of a run is
+It reads `results/`, writes `docs/pictures/gap.svg` and prints the numbers of the first two tables of `docs/results/README.md`. The share of a run is
 (return - total at the end) / (true rewards - total at the end), with means over seeds as the two references. A seed that was trained
 several times counts once, with the mean of its runs. Intervals are those of 95% by a bootstrap over tasks and over seeds, of the
 references too. A task has a share if its gap is larger than two standard errors.
@@ -21,7 +21,7 @@ from headline import COMPARISONS, THREE_SEEDS, Comparison, Seeds, Sources, read_
 from lare_rl.report.figures import COLOURS, add_white_background, to_svg
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "gap.svg"
-RAW, PAPER, DEFAULT = "best published decoder of raw features", "LaRe with the paper's decoder", "lare-bayes"
+RAW, PAPER, DEFAULT = "best decoder of raw features", "LaRe with the paper's decoder", "lare-bayes"
 METHODS = (RAW, PAPER, DEFAULT)
 STYLES = {RAW: ("s", "#777777"), PAPER: ("^", COLOURS[1]), DEFAULT: ("o", COLOURS[0])}
 REPETITIONS = 10_000

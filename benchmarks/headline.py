@@ -132,7 +132,7 @@ COMPARISONS = {
     "trains, IPPO": simulator("Trains", "ippo", 60_000),
     f"{HALF_CHEETAH}, TD3": scores(f"scores/cheetah/{HALF_CHEETAH},paidonce/", 30_000, "rrdu", "lrr", "grd", "rudder"),
     f"{WALKER}, TD3": sweep("published", WALKER, "rrdu", "lrr", "grd", "rudder"),
-    "Hopper-v5, TD3": sweep("unseen", "Hopper-v5", "rrdu"),
+    "Hopper-v5, TD3": sweep("unseen", "Hopper-v5", "rrdu", "lrr"),
     "Reacher-v4, TD3": sweep("headline", "Reacher-v4", "rrdu"),
     "HalfCheetahTarget-v4, TD3": sweep("headline", "HalfCheetahTarget-v4", "rrdu"),
     "HalfCheetahThreshold-v4, TD3": scores(
