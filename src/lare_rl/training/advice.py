@@ -127,9 +127,8 @@ def find_large_observations(run: Run, replay: Replay, config: TrainConfig) -> li
     if can_normalise:
         alternative = Finding("normalise", {"algorithm": algorithm})
     sizes = {"observation": config.env.observation_size}
-    task = (
-        run.config.task
-    )  # with the credit scope "state", its text describes the state; each team has a text of its own
+    task = run.config.task
+    # With the credit scope "state", the text describes the state. Each team has a text of its own.
     text = "" if config.team_level or task.teams else task.observation
     feature = raw_feature_names(text, "", sizes)[largest]
     values = {"feature": feature, "rms": float(rms[largest]), "algorithm": algorithm, "alternative": alternative}
