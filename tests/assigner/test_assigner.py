@@ -395,9 +395,8 @@ def test_add_and_add_episode_refuse(values, message):
         (credit.add if "terminated" in values else credit.add_episode)(**values)
     assert credit.store.n_added == 0
     credit.add(**ROWS)
-    credit.add_episode(
-        **STEPS | {"next_observation": np.ones((2, 2)), "reward": 1.0}
-    )  # steps need not follow each other
+    # Steps need not follow each other.
+    credit.add_episode(**STEPS | {"next_observation": np.ones((2, 2)), "reward": 1.0})
     assert (credit.store.n_ended, credit.store.dropped) == (1, 0)
 
 

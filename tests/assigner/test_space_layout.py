@@ -54,9 +54,8 @@ def test_rows_equal_flatten_of_gymnasium(space, count, seed):
     assert rows.shape == (count, layout.size) == (count, spaces.flatdim(space))
     np.testing.assert_array_equal(rows, np.float32([spaces.flatten(space, value) for value in values]))
     np.testing.assert_array_equal(layout.rows(split(batch), "observation"), rows.reshape(2, count // 2, -1))
-    if space.shape != () or isinstance(
-        space, spaces.Discrete
-    ):  # rows of a Box without an axis are read as its elements
+    # Rows of a Box without an axis are read as its elements.
+    if space.shape != () or isinstance(space, spaces.Discrete):
         np.testing.assert_array_equal(layout.rows(rows, "observation"), rows)
 
 

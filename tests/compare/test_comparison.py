@@ -83,9 +83,8 @@ def test_step_and_last_quarter(make_run):
     """The scores at the five evaluations are a fifth, two fifths, ... of the last one."""
     steps = (20, 40, 60, 80, 100)
     runs = [make_run("a", [5.0, 15.0], steps=steps), make_run("b", [10.0, 20.0], method="rd", steps=steps)]
-    assert [row.mean for row in compare(read(runs), ScoreChoice(average_last_quarter=True)).rows] == pytest.approx(
-        [9.0, 13.5]
-    )  # steps 80 and 100
+    late = compare(read(runs), ScoreChoice(average_last_quarter=True))
+    assert [row.mean for row in late.rows] == pytest.approx([9.0, 13.5])  # steps 80 and 100
     early = compare(read(runs), ScoreChoice(step=60))
     assert [row.mean for row in early.rows] == pytest.approx([6.0, 9.0])
     assert list(early.curves["rd"].x) == [20, 40, 60]

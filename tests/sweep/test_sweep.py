@@ -312,10 +312,11 @@ def test_directory_of_another_run(file):
     file.write_text(FILE.replace("steps = 200", "steps = 120"))
     with pytest.raises(LareError, match=r"not 150: (?!.*--resume)"):
         read_sweep(file)
+    # Settings of other algorithms and methods do not matter.
     for change in (
         'algorithms = ["td3", "sac"]' + FILE + "sac = { gamma = 0.9 }\n",
         FILE + 'credit = { score = "average" }\n',
-    ):  # settings of other algorithms and methods do not matter
+    ):
         file.write_text(change)
         assert read_sweep(file)[1][0].done
     file.write_text(FILE)

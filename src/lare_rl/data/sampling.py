@@ -170,9 +170,8 @@ def _credit_sample(episodes: EpisodeSample, layout: Layout) -> CreditSample:
 def _pack(episodes: EpisodeSample, rows: int) -> CreditSample:
     """Put whole episodes one after the other. Episodes that do not fit into the rows are left out."""
     layout, mask = lay_out_packed(episodes.length, episodes.mask, rows)
-    index = jnp.where(
-        layout.episode_index < len(mask), layout.episode_index, 0
-    )  # padding reads a step that is certainly stored
+    # Padding reads a step that is certainly stored.
+    index = jnp.where(layout.episode_index < len(mask), layout.episode_index, 0)
     steps = Index(episodes.first.env[index], episodes.first.number[index] + layout.step)
     return CreditSample(steps, layout.episode_index, episodes._replace(mask=mask))
 
