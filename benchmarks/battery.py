@@ -92,7 +92,7 @@ def beside_a_potential(run: lare_rl.Run) -> list[dict[str, float]]:
     results = []
     for seed_index in range(len(run.seeds)):
         i = select_seed(learner, seed_index)
-        steps = replay.read(i.replay, replay.newest_steps(i.replay, RECENT_STEPS))
+        steps = replay.read_newest(i.replay, RECENT_STEPS)
         r_hat = np.asarray(rewards(steps, i.decoders, config))[0, :, 0]
         before, after = (
             np.asarray(timestep["observation"])[0, :, 0] for timestep in (steps.columns, steps.next_columns)

@@ -2,9 +2,9 @@
 
     python benchmarks/gap.py
 
-It reads `results/`, writes `docs/pictures/gap.svg` and prints the numbers of the first two tables of `docs/results/README.md`. The share of a run is
-(return - total at the end) / (true rewards - total at the end), with means over seeds as the two references. A seed that was trained
-several times counts once, with the mean of its runs. Intervals are those of 95% by a bootstrap over tasks and over seeds, of the
+It reads `results/`, writes `docs/pictures/gap.svg` and prints the numbers of the first two tables of `docs/results/README.md`. The share
+of a run is (return - total at the end) / (true rewards - total at the end), with means over seeds as the two references. A seed that was
+trained several times counts once, with the mean of its runs. Intervals are those of 95% by a bootstrap over tasks and over seeds, of the
 references too. A task has a share if its gap is larger than two standard errors.
 """
 

@@ -106,7 +106,7 @@ def sweep(study: str, task: str, *raw: str) -> Comparison:
     )
 
 
-def scores(sources: str, steps: int, *raw: str, paper: str = "lare-rrdu", without_phi: bool = True) -> Comparison:
+def score_study(sources: str, steps: int, *raw: str, paper: str = "lare-rrdu", without_phi: bool = True) -> Comparison:
     """A study of `scores.training`. Its methods' runs, or its tables, are at `sources` with the label of the method."""
 
     def labelled(label: str) -> Sources:
@@ -130,16 +130,18 @@ COMPARISONS = {
     "job shop, PPO": simulator("JobShop", "ppo", 100_000, WHOLE_EPISODE, WHOLE_EPISODE),
     "power grid, PPO": simulator("Grid", "ppo", 30_720),
     "trains, IPPO": simulator("Trains", "ippo", 60_000),
-    f"{HALF_CHEETAH}, TD3": scores(f"scores/cheetah/{HALF_CHEETAH},paidonce/", 30_000, "rrdu", "lrr", "grd", "rudder"),
+    f"{HALF_CHEETAH}, TD3": score_study(
+        f"scores/cheetah/{HALF_CHEETAH},paidonce/", 30_000, "rrdu", "lrr", "grd", "rudder"
+    ),
     f"{WALKER}, TD3": sweep("published", WALKER, "rrdu", "lrr", "grd", "rudder"),
     "Hopper-v5, TD3": sweep("unseen", "Hopper-v5", "rrdu", "lrr"),
     "Reacher-v4, TD3": sweep("headline", "Reacher-v4", "rrdu"),
     "HalfCheetahTarget-v4, TD3": sweep("headline", "HalfCheetahTarget-v4", "rrdu"),
-    "HalfCheetahThreshold-v4, TD3": scores(
+    "HalfCheetahThreshold-v4, TD3": score_study(
         "scores/threshold/HalfCheetahThreshold-v4/", 60_000, "rrdu", without_phi=False
     ),
-    "PP-6, IPPO": scores("scores_published.json:PP-6, late:", 205_000, "rrdu", "lrr", paper="lare-rd"),
-    "CN-6, IPPO": scores("scores_published.json:CN-6, late:", 205_000, "rrdu", "lrr", paper="lare-rd"),
+    "PP-6, IPPO": score_study("scores_published.json:PP-6, late:", 205_000, "rrdu", "lrr", paper="lare-rd"),
+    "CN-6, IPPO": score_study("scores_published.json:CN-6, late:", 205_000, "rrdu", "lrr", paper="lare-rd"),
 }
 """Ten seeds for each method."""
 

@@ -33,7 +33,7 @@ def write_log(run: lare_rl.Run, out: Path) -> list[float]:
     """Write the training episodes of a run's first seed as .npz files with their scores. Returns the episodes' returns."""
     _, learner, host, _ = load_learner(run)
     buffer = select_seed(learner).replay
-    steps = replay.read(buffer, replay.newest_steps(buffer, host["step"]))
+    steps = replay.read_newest(buffer, host["step"])
     observation, next_observation = (
         np.asarray(timestep["observation"])[0, :, 0] for timestep in (steps.columns, steps.next_columns)
     )

@@ -54,7 +54,7 @@ def updates(
 
 def newest(learner: Learner, config: TrainConfig) -> tuple[jax.Array, jax.Array]:
     """Features and true rewards of the last steps."""
-    recent = replay.read(learner.replay, replay.newest_steps(learner.replay, RECENT_STEPS))
+    recent = replay.read_newest(learner.replay, RECENT_STEPS)
     return decoder_inputs(recent, config, 0)[0], recent.columns["reward"][0, :, 0]
 
 

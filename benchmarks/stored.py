@@ -30,7 +30,7 @@ def stored_episodes(directory: str) -> Iterator[Stored]:
     learner = load_learner(run)[1]
     for seed_index in range(len(run.seeds)):
         stored_replay = select_seed(learner, seed_index).replay
-        steps = replay.read(stored_replay, replay.newest_steps(stored_replay, int(stored_replay.next_transition[0])))
+        steps = replay.read_newest(stored_replay, int(stored_replay.next_transition[0]))
         after, action, factors, reward = (
             np.asarray(array)[0, :, 0]
             for array in (

@@ -146,7 +146,7 @@ def test_export_agrees_with_jax(kind, method, export_run):
     # Random steps, because a replay may hold only the factors of its steps.
     steps = random_steps(config.env, config.n_envs)
     buffer = jax.jit(partial(learners.store, config=config, phi=run.graphs))(seed_learner, steps)[0].replay
-    stored = jax.tree.map(jnp.concatenate, replay.read(buffer, replay.newest_steps(buffer, TOTAL)))
+    stored = jax.tree.map(jnp.concatenate, replay.read_newest(buffer, TOTAL))
     steps = jax.tree.map(lambda leaf: np.concatenate(np.swapaxes(leaf, 0, 1)), steps)
     # Exported rewards are in the unit of the true rewards, before they are scaled.
     unscaled = replace(config, scale_rewards=False)

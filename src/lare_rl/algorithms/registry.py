@@ -147,14 +147,9 @@ def register_algorithm(algorithm: Algorithm) -> None:
             f"algorithm {algorithm.name}: the settings of an algorithm that consumes {algorithm.consumes} derive from "
             f"{base.__module__}:{base.__name__}: pass an instance of such a class"
         )
-    kinds = {
-        Consumes.TRANSITIONS: (
-            algorithm.discrete or algorithm.multi_agent,
-            "one agent with continuous actions: pass discrete=False, multi_agent=False",
-        ),
-        Consumes.SEQUENCES: (algorithm.continuous, "discrete actions: pass continuous=False"),
-    }
-    is_impossible, kind = kinds.get(algorithm.consumes, (False, ""))
-    if is_impossible:
-        raise LareError(f"algorithm {algorithm.name}: one that consumes {algorithm.consumes} trains {kind}")
+    trains = f"algorithm {algorithm.name}: one that consumes {algorithm.consumes} trains"
+    if algorithm.consumes is Consumes.TRANSITIONS and (algorithm.discrete or algorithm.multi_agent):
+        raise LareError(f"{trains} one agent with continuous actions: pass discrete=False, multi_agent=False")
+    if algorithm.consumes is Consumes.SEQUENCES and algorithm.continuous:
+        raise LareError(f"{trains} discrete actions: pass continuous=False")
     ALGORITHMS.register(algorithm.name, algorithm)

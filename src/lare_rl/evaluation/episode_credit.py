@@ -80,9 +80,10 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
     @jax.jit
     def read_rewards(learner: Learner, index: Index) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
         if config.is_exact:  # a checkpoint may hold no predictions, or old ones
-            oldest = replay.segments_as_episodes(learner.replay).oldest
+            segments = replay.segments_as_episodes(learner.replay)
+            since = segments.current_episode.at[0].set(replay.look_up(segments.episode, index.env[0], index.number[0]))
             with float64():
-                learner = predict_returns(learner, oldest, config)
+                learner = predict_returns(learner, since, config)
         steps = replay.read(learner.replay, index)
         return steps, rewards(steps, learner.decoders, replace(config, scale_rewards=False))
 

@@ -70,8 +70,8 @@ def record_frames(
     """Return the frames that `record_video` shows, and the seconds for which it shows each.
 
     Args:
-        max_fps: the largest number of frames per second, for a simulation on the host. A film of an environment in JAX has 25 frames
-            per second. A film of many agents has 8 frames per second.
+        max_fps: the largest number of frames per second, for a simulation on the host. An environment in JAX is shown at 25 frames
+            per second, and a team at 8.
         max_frames: the largest number of frames. A longer film ends early; that of a single agent in JAX leaves steps out, and so
             shows the episode faster.
 

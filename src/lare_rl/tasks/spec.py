@@ -92,11 +92,11 @@ def _to_json(value: Any) -> Any:
         return {key: _to_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_to_json(item) for item in value]
-    if value is not None and not (isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value))):
-        raise ValueError(
-            f"{short_repr(value)} cannot be stored as JSON. Use finite numbers, texts, booleans, lists and tables with texts as keys."
-        )
-    return value
+    if value is None or isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    raise ValueError(
+        f"{short_repr(value)} cannot be stored as JSON. Use finite numbers, texts, booleans, lists and tables with texts as keys."
+    )
 
 
 class TaskSpec(CheckedModel):
