@@ -114,15 +114,16 @@ class Coalitions(eqx.Module):
         # Returns are predicted where float64 is on. With a probability in float32, the random draws are the same there.
         coins = jax.random.bernoulli(mask_key, jnp.float32(0.5), (COALITIONS, agents, agents))
         mask = coins | jnp.eye(agents, dtype=bool)
-        attention = attend(
-            jnp.tile(query, (COALITIONS, 1, 1)),  # each agent needs a query for each coalition
-            _split_heads(self.key(x)),
-            _split_heads(self.value(x)),
-            mask.reshape(-1, agents),
-            partial(dropout, key=dropout_keys[0]),
-        )
+
+        def transform(weights: Float[Array, "rows masks queries agents"]) -> Float[Array, "rows outputs queries agents"]:
+            if dropout_key is not None:
+                return dropout(weights, dropout_keys[0])
+            # Without dropout, what follows is linear: the mean over coalitions costs least here.
+            return jnp.mean(weights, axis=1, keepdims=True)
+
+        attention = attend(query, _split_heads(self.key(x)), _split_heads(self.value(x)), mask, transform)
         merged = dropout(self.merge(attention), dropout_keys[1])
-        return jnp.mean(merged.reshape(*x.shape[:-2], COALITIONS, *x.shape[-2:]), axis=-3)
+        return jnp.mean(merged.reshape(*x.shape[:-2], -1, *x.shape[-2:]), axis=-3)
 
 
 class STAS(eqx.Module):

@@ -30,16 +30,16 @@ def attend(
     query: Float[Array, "*batch queries heads size"],
     key: Float[Array, "*batch tokens heads size"],
     value: Float[Array, "*batch tokens heads size"],
-    mask: Bool[Array, "queries tokens"] | None = None,
-    dropout: Callable[[Array], Array] = lambda weights: weights,
-) -> Float[Array, "*batch queries concatenated"]:
+    mask: Bool[Array, "*masks queries tokens"] | None = None,
+    transform: Callable[[Array], Array] = lambda weights: weights,
+) -> Float[Array, "*batch outputs concatenated"]:
     """Return softmax(Q K^T / sqrt(size)) V of each head, concatenated over heads (Vaswani et al., 2017, Eq. 1).
 
     Args:
-        mask: which tokens each query attends to.
-        dropout: a function that is applied to the attention weights.
+        mask: which tokens each query attends to. With several masks, each query has an output for each of them, mask by mask.
+        transform: a function of the attention weights, [rows, *masks, queries, tokens]: dropout, or a mean over masks.
     """
-    *batch, queries, heads, size = query.shape
+    *batch, _, heads, size = query.shape
 
     def by_head(x: Float[Array, "*batch tokens heads size"]) -> Float[Array, "rows tokens size"]:
         # Batch axes and heads become one axis, because XLA is fastest at products of arrays with three axes.
@@ -47,9 +47,11 @@ def attend(
 
     scores = jax.lax.batch_matmul(by_head(query), jnp.swapaxes(by_head(key), 1, 2)) / jnp.sqrt(size)
     if mask is not None:
-        scores = jnp.where(mask, scores, -1e9)
-    output = jax.lax.batch_matmul(dropout(jax.nn.softmax(scores)), by_head(value))
-    return jnp.swapaxes(output.reshape(*batch, heads, queries, size), -2, -3).reshape(*batch, queries, -1)
+        scores = jnp.where(mask, scores if mask.ndim == 2 else scores[:, None], -1e9)
+    weights = transform(jax.nn.softmax(scores))
+    output = jax.lax.batch_matmul(weights.reshape(len(scores), -1, weights.shape[-1]), by_head(value))
+    by_query = jnp.swapaxes(output.reshape(*batch, heads, -1, size), -2, -3)
+    return by_query.reshape(*by_query.shape[:-2], heads * size)
 
 
 def causal_mask(length: int) -> Bool[Array, "length length"]:
