@@ -115,7 +115,9 @@ class Coalitions(eqx.Module):
         coins = jax.random.bernoulli(mask_key, jnp.float32(0.5), (COALITIONS, agents, agents))
         mask = coins | jnp.eye(agents, dtype=bool)
 
-        def transform(weights: Float[Array, "rows masks queries agents"]) -> Float[Array, "rows outputs queries agents"]:
+        def transform(
+            weights: Float[Array, "rows masks queries agents"],
+        ) -> Float[Array, "rows outputs queries agents"]:
             if dropout_key is not None:
                 return dropout(weights, dropout_keys[0])
             # Without dropout, what follows is linear: the mean over coalitions costs least here.
