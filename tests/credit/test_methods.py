@@ -137,6 +137,8 @@ def test_register_refuses(registered):
             register_method(Method("mine", "mine", "this test", inputs, Fit.ALL_STEPS))
     with pytest.raises(LareError, match="another method 'rd'"):
         register_method(Method("rd", "mine", "this test", methods.RAW, Fit.ALL_STEPS))
+    with pytest.raises(LareError, match="SIGNS needs factors"):
+        register_method(Method("mine", "mine", "this test", methods.RAW, Fit.SIGNS, "linear"))
     with pytest.raises(LareError, match="no decoder 'nothing'"):
         register_method(Method("new", "mine", "this test", decoder="nothing"))
     with pytest.raises(LareError, match="whole_episodes"):

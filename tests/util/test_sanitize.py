@@ -2,7 +2,7 @@
 
 import pytest
 
-from lare_rl.util.sanitize import first_invisible, one_line, sanitize
+from lare_rl.util.sanitize import first_invisible, is_name, one_line, sanitize
 
 INVISIBLE = {
     "escape": "\x1b",
@@ -28,3 +28,19 @@ def test_invisible_characters(letter):
 def test_visible_texts(text):
     assert first_invisible(text) is None
     assert sanitize(text) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        ("tests pass", True),
+        ("x" * 80, True),
+        ("x" * 81, False),
+        ("", False),
+        (" a", False),
+        ("a\nb", False),
+        (1, False),
+    ],
+)
+def test_is_name(value, expected):
+    assert is_name(value) is expected

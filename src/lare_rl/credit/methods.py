@@ -199,8 +199,8 @@ def _find_conflict(method: Method) -> str | None:
         return None
     if method.inputs is None or fit is None:
         return "proxy rewards need inputs and a fit"
-    if fit is Fit.SIGNS and (kind.extended_basis or not kind.closed_form):
-        return "Fit.SIGNS needs the decoder 'linear'"
+    if fit is Fit.SIGNS and (kind.extended_basis or not kind.closed_form or not method.needs_phi):
+        return "Fit.SIGNS needs factors and the decoder 'linear'"
     if fit.closed_form != kind.closed_form:
         needed = "decoder 'linear' or 'additive'" if fit.closed_form else "decoder with gradients"
         return f"Fit.{fit.name} needs a {needed}, not {decoder!r}"

@@ -128,7 +128,7 @@ def to_float(value: Any) -> float:
     """Return a value as a float. Raises `ValueError`, whose message is a predicate, if it is not a number."""
     try:
         return float(value)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one of a tensor of several numbers
         raise ValueError(f"is {short_repr(value)}, which is not a number") from None
 
 

@@ -21,7 +21,7 @@ from lare_rl.phi.limits import MAX_FACTORS, MAX_INT_BITS, MAX_TEXT_LENGTH, Refus
 from lare_rl.phi.read import located_refusal, parse
 from lare_rl.phi.runtime import Meter
 from lare_rl.phi.values import Bound, Function, describe
-from lare_rl.util.sanitize import one_line
+from lare_rl.util.sanitize import NAME_RULE, is_name
 
 __all__ = ["NO_FUNCTION", "TURN_FUNCTION_NAME", "parse_turn_program", "read_events", "shorten"]
 
@@ -29,10 +29,10 @@ TURN_FUNCTION_NAME = "turn_events"
 """The name of the function that a program must define."""
 NO_FUNCTION = f"there is no function {TURN_FUNCTION_NAME}(tool, arguments, result, text)"
 MAX_STEPS = 150_000  # for one call; a method of a text takes a step for each of its characters
-MAX_NAME_LENGTH = 60  # of an event
 MAX_EVENT_VALUE = 1e6
 MAX_ARGUMENTS = 100  # entries of the arguments, and of each list or dictionary within them
 MAX_ARGUMENT_DEPTH = 4
+MAX_KEY_LENGTH = 240
 MAX_FOUND_NUMBERS = 1000
 MAX_NUMBER = 1e300  # in texts and arguments; larger ones become this one
 OMISSION = "\n... (the middle of a long text is left out) ...\n"
@@ -104,7 +104,7 @@ def _copy_argument(value: Any, depth: int = 0) -> Any:
         return "..."
     if isinstance(value, Mapping):
         entries = list(value.items())[:MAX_ARGUMENTS]
-        return {shorten(str(key), MAX_NAME_LENGTH * 4): _copy_argument(item, depth + 1) for key, item in entries}
+        return {shorten(str(key), MAX_KEY_LENGTH): _copy_argument(item, depth + 1) for key, item in entries}
     if isinstance(value, list | tuple):
         return [_copy_argument(item, depth + 1) for item in value[:MAX_ARGUMENTS]]
     return "..."
@@ -130,9 +130,8 @@ def _check_events(events: Any) -> dict[str, float]:
         raise RefusedError("E-FORM", f"{TURN_FUNCTION_NAME} must return 1 to {MAX_FACTORS} events, not {len(events)}")
     result = {}
     for name, value in events.items():
-        if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME_LENGTH or name != one_line(name):
-            rule = f"a text of 1 to {MAX_NAME_LENGTH} visible characters, without line breaks, and spaces only between words"
-            raise RefusedError("E-FORM", f"the name of an event must be {rule}, and is {short_repr(name)}")
+        if not is_name(name):
+            raise RefusedError("E-FORM", f"the name of an event must be {NAME_RULE}, and is {short_repr(name)}")
         if not isinstance(value, bool | int | float):
             raise RefusedError("E-FORM", f"the event {name!r} must be a number or a truth value, not {describe(value)}")
         if not abs(value) <= MAX_EVENT_VALUE:

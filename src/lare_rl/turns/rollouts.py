@@ -21,7 +21,7 @@ import numpy as np
 
 from lare_rl.errors import LareError, short_repr
 from lare_rl.turns.messages import Turn, check_list, message_features, split_turns
-from lare_rl.util.sanitize import one_line
+from lare_rl.util.sanitize import NAME_RULE, is_name, one_line
 
 __all__ = ["MAX_NUMBER", "Phi", "Rollout", "read_rollout", "read_rollouts"]
 
@@ -30,8 +30,6 @@ MAX_NUMBER = 1e9
 MIN_NUMBER = 1e-9
 """Smaller numbers are read as 0: their squares would be too small for a fit."""
 MAX_TURNS = 10_000
-MAX_NAME = 80
-"""Characters of the name of a number."""
 
 Row = dict[str, float]
 """The numbers of a turn, by their names."""
@@ -131,11 +129,8 @@ def _read_row(row: Any, what: str, where: str) -> Row:
         raise LareError(f"{where}: {what} must map names to numbers, and is {short_repr(row)}")
     numbers = {}
     for name, value in row.items():
-        if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or name != one_line(name):
-            raise LareError(
-                f"{where}: {what} has the name {short_repr(name)}: a name is a text of 1 to {MAX_NAME} visible characters, without line "
-                "breaks, and spaces only between words"
-            )
+        if not is_name(name):
+            raise LareError(f"{where}: {what} has the name {short_repr(name)}, which must be {NAME_RULE}")
         numbers[name] = _read_number(value, f"{where}: {name!r} in {what}")
     return numbers
 

@@ -18,7 +18,7 @@ def as_numbers(name: str, values: Any) -> Float[np.ndarray, "*shape"]:
             if array.dtype.kind == "c":
                 raise TypeError("complex numbers")
             return array.astype(np.float32, copy=False)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one of a tensor with a gradient
         raise LareError(f"{name}s must be arrays of numbers, not {short_repr(values)}") from None
 
 

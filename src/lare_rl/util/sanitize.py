@@ -3,7 +3,20 @@
 import re
 import unicodedata
 
-__all__ = ["abbreviate", "first_invisible", "last_line", "one_line", "replace_surrogates", "sanitize"]
+__all__ = [
+    "NAME_RULE",
+    "abbreviate",
+    "first_invisible",
+    "is_name",
+    "last_line",
+    "one_line",
+    "replace_surrogates",
+    "sanitize",
+]
+
+MAX_NAME_LENGTH = 80
+NAME_RULE = f"a text of 1 to {MAX_NAME_LENGTH} visible characters, without line breaks, and spaces only between words"
+"""The rule of `is_name`, for messages."""
 
 # Invisible letters and marks (Default_Ignorable_Code_Point), and the empty Braille pattern.
 _FILLERS = re.compile(
@@ -33,6 +46,11 @@ def sanitize(text: str) -> str:
 def one_line(text: object) -> str:
     """Sanitize a text, and write it in one line."""
     return sanitize(" ".join(str(text).split()))
+
+
+def is_name(value: object) -> bool:
+    """Return whether a value can be the name of a number in tables and messages: see `NAME_RULE`."""
+    return isinstance(value, str) and 0 < len(value) <= MAX_NAME_LENGTH and value == one_line(value)
 
 
 def replace_surrogates(text: str) -> str:
