@@ -1,6 +1,5 @@
 from contextlib import nullcontext
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -58,14 +57,6 @@ def test_loss_against_numpy(monkeypatch):
         return reward_loss + state_loss + np.mean((r_hat - reward) ** 2)
 
     check_loss(decoder, random_rows(4, STEPS, 2 * STATES + ACTIONS), [5, 4, 2, 1], bag_loss)
-
-
-def test_a_tenth_is_dropped():
-    x = jnp.ones((100, 200))
-    output = np.asarray(rbt._dropout(x, jax.random.key(0)))
-    assert np.mean(output == 0) == pytest.approx(0.1, abs=0.02)
-    np.testing.assert_allclose(output[output > 0], 1 / 0.9, rtol=1e-5)
-    np.testing.assert_array_equal(rbt._dropout(x, None), x)
 
 
 @pytest.mark.long

@@ -3,18 +3,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from helpers.decoder_toys import make_decoder
-from lare_rl.credit.stas import dropout
 
 STEPS, AGENTS = 5, 3
 KEY = jax.random.key(1)
 
 
-def test_dropout_and_mean_over_samples():
-    output = np.asarray(dropout(jnp.ones((50, 20, 13)), KEY))
-    assert set(np.unique(output)) == {0, 2}
-    assert np.abs(output.mean(axis=0) - 1).max() < 0.75  # over 50: 5 standard deviations
-    assert np.abs(np.corrcoef(output.reshape(-1, 13).T) - np.eye(13)).max() < 0.2
-    np.testing.assert_array_equal(dropout(jnp.ones(3), None), 1)
+def test_mean_over_samples():
     # It is nearer to the mean over many samples than a single sample.
     decoder = make_decoder("stas", 6, STEPS, AGENTS, seed=1)
     rows = np.random.default_rng(0).normal(size=(2 * STEPS, AGENTS, 6)).astype(np.float32)

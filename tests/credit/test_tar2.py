@@ -31,7 +31,7 @@ def numpy_output(decoder, episode, key):
     for i, layer_key in enumerate(jax.random.split(key, 3)):
         mask_key, order_key = jax.random.split(layer_key)
         x = np.stack([numpy_time_layer(decoder.time_layers[i], x[:, agent]) for agent in range(AGENTS)], axis=1)
-        x = x + np.asarray(decoder.agent_numbers)[i][np.asarray(jax.random.permutation(order_key, AGENTS))]
+        x = x + np.asarray(decoder.index_embeddings)[i][np.asarray(jax.random.permutation(order_key, AGENTS))]
         masks = np.asarray(jax.random.bernoulli(mask_key, 0.5, (5, AGENTS, AGENTS))) | np.eye(AGENTS, dtype=bool)
         x = np.stack([numpy_coalitions(decoder.agent_layers[i], step, masks) for step in x])
         outputs.append(x)

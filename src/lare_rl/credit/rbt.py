@@ -25,6 +25,7 @@ from lare_rl.credit.decoders import RBT_STEPS
 from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, is_step, step_loss
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
+from lare_rl.nn.dropout import dropout
 from lare_rl.nn.masks import masked_mean
 from lare_rl.nn.networks import MLP, Linear
 
@@ -33,12 +34,6 @@ __all__ = ["RBT", "Block"]
 LAYERS = 3
 DROPOUT = 0.1
 """The probability that an activation is dropped in an update."""
-
-
-def _dropout(x: Float[Array, "*shape"], key: PRNGKeyArray | None) -> Float[Array, "*shape"]:
-    if key is None:
-        return x
-    return jnp.where(jax.random.bernoulli(key, 1 - DROPOUT, x.shape), x / (1 - DROPOUT), 0)
 
 
 class Block(eqx.Module):
@@ -62,9 +57,11 @@ class Block(eqx.Module):
     ) -> Float[Array, "episodes tokens size"]:
         keys = split_key(key, 3)
         query, projected_key, value = jnp.split(self.projections(self.norms[0](x))[..., None, :], 3, axis=-1)
-        attended = attend(query, projected_key, value, causal_mask(x.shape[1]), partial(_dropout, key=keys[0]))
-        x = x + _dropout(self.merge(attended), keys[1])
-        return x + _dropout(self.feed_forward(self.norms[1](x)), keys[2])
+        attended = attend(
+            query, projected_key, value, causal_mask(x.shape[1]), partial(dropout, key=keys[0], rate=DROPOUT)
+        )
+        x = x + dropout(self.merge(attended), keys[1], DROPOUT)
+        return x + dropout(self.feed_forward(self.norms[1](x)), keys[2], DROPOUT)
 
 
 def _positions(n_steps: int, size: int) -> Float[Array, "steps size"]:
@@ -119,7 +116,7 @@ class RBT(eqx.Module):
         position = _positions(inputs.shape[1], self.embed_state.weight.shape[1])
         tokens = jnp.stack([self.embed_action(action) + position, self.embed_state(state) + position], axis=2)
         x = self.first_norm(tokens.reshape(len(inputs), -1, tokens.shape[-1]))
-        x = _dropout(x, keys[0])
+        x = dropout(x, keys[0], DROPOUT)
         for block, block_key in zip(self.blocks, keys[1:], strict=True):
             x = block(x, block_key)
         x = self.last_norm(x).reshape(tokens.shape)

@@ -1,12 +1,13 @@
-"""STAS: spatial-temporal return decomposition (Chen et al., AAAI 2024), its first and default version.
+"""STAS: spatial-temporal return decomposition (Chen et al., AAAI 2024), after version "v1" of the authors' code, its default.
 
 Causal attention over the steps of each agent is followed by attention over the agents of each step, under random coalitions.
 The mean over the coalitions approximates the Shapley value of an agent:
 
     r_hat_{i,t} = w . mean_k attention(h_t, mask_k)_i,    mask_k ~ Bernoulli(1/2)^{n x n}, 1 on the diagonal
 
-w includes a bias, the result is multiplied by `CreditSpec.output_scale`, and k = 1..`COALITIONS`. During learning, each batch has its own
-samples of coalitions, of the order of agents' index embeddings, and of dropout. A reward is the mean over `REWARD_SAMPLES` samples,
+h_t are the outputs of the attention over steps, one row for each agent, and k = 1..`COALITIONS`. w includes a bias, and the result is
+multiplied by `CreditSpec.output_scale`. During learning, each batch (or chunk of a large one) has its own samples of coalitions, of the
+order of agents' index embeddings, and of dropout. A reward is the mean over `REWARD_SAMPLES` samples,
 which are the same at each call.
 """
 
@@ -21,22 +22,16 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from lare_rl.credit.decoder_network import DecoderOutput, split_key
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
+from lare_rl.nn.dropout import dropout
 from lare_rl.nn.networks import MLP, Linear
 
-__all__ = ["STAS", "Coalitions", "TimeLayer", "dropout", "gelu", "mean_over_samples"]
+__all__ = ["STAS", "Coalitions", "TimeLayer", "gelu", "mean_over_samples"]
 
 SIZE, HEADS, LAYERS, COALITIONS = 128, 4, 3, 5
 """The width of a token, the number of heads, of layers over time, and of sampled coalitions."""
 REWARD_SAMPLES = 8
-
-
-def dropout(x: Float[Array, "..."], key: PRNGKeyArray | None) -> Float[Array, "..."]:
-    """Set half of the entries, chosen at random, to 0 and double the others. Without a key, return x."""
-    if key is None:
-        return x
-    # One random bit per entry: a random float per entry would take a fifth of the run time of STAS.
-    coins = jnp.unpackbits(jax.random.bits(key, (-(-x.size // 8),), jnp.uint8))
-    return 2 * x * coins[: x.size].reshape(x.shape)
+DROPOUT = 0.5
+"""The probability that an activation is dropped in an update."""
 
 
 def gelu(x: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -55,7 +50,7 @@ def _split_heads(x: Float[Array, "*batch size"]) -> Float[Array, "*batch heads h
 
 
 class TimeLayer(eqx.Module):
-    """a = attention(x), out = LN(FF(LN(x + a)) + 2 a). As published, x itself is not added again. `HEADS` divides the size."""
+    """a = attention(x), out = LN(FF(LN(x + a)) + 2 a). As published, x itself is not added again. The size is a multiple of `HEADS`."""
 
     query: Linear
     key: Linear
@@ -74,17 +69,20 @@ class TimeLayer(eqx.Module):
         self, x: Float[Array, "*batch steps size"], key: PRNGKeyArray | None
     ) -> Float[Array, "*batch steps size"]:
         dropout_keys = split_key(key, 3)
-        query, keys, value = (_split_heads(layer(x)) for layer in (self.query, self.key, self.value))
-        attention = attend(query, keys, value, causal_mask(x.shape[-2]), partial(dropout, key=dropout_keys[0]))
-        a = dropout(self.merge(attention), dropout_keys[1])
+        query, projected_key, value = (_split_heads(layer(x)) for layer in (self.query, self.key, self.value))
+        attention = attend(
+            query, projected_key, value, causal_mask(x.shape[-2]), partial(dropout, key=dropout_keys[0], rate=DROPOUT)
+        )
+        a = dropout(self.merge(attention), dropout_keys[1], DROPOUT)
         hidden = self.norms[0](x + a)
-        return self.norms[1](dropout(self.feed_forward(hidden), dropout_keys[2]) + 2 * a)
+        return self.norms[1](dropout(self.feed_forward(hidden), dropout_keys[2], DROPOUT) + 2 * a)
 
 
 class Coalitions(eqx.Module):
-    """Attention over agents, averaged over random coalitions. Each agent has its own projection to queries, and `HEADS` divides the size.
+    """Attention over agents, averaged over random coalitions. Each agent has its own projection to queries.
 
-    To each agent an index embedding is added, in a random order.
+    An index embedding is added to each agent: which one is random, and the same at all steps of a call. The size is a multiple of
+    `HEADS`.
     """
 
     query: Linear
@@ -101,17 +99,17 @@ class Coalitions(eqx.Module):
     def __call__(
         self,
         x: Float[Array, "*batch agents size"],
-        numbers: Float[Array, "agents size"],
+        index_embeddings: Float[Array, "agents size"],
         key: PRNGKeyArray,
         dropout_key: PRNGKeyArray | None,
     ) -> Float[Array, "*batch agents size"]:
-        """Return the mean over `COALITIONS` random masks, with one random order of the index embeddings `numbers`."""
-        agents = len(numbers)
+        """Return the mean over `COALITIONS` random masks, with one random order of the index embeddings."""
+        agents = len(index_embeddings)
         mask_key, order_key = jax.random.split(key)
-        x = x + numbers[jax.random.permutation(order_key, agents)]
+        x = x + index_embeddings[jax.random.permutation(order_key, agents)]
         dropout_keys = split_key(dropout_key, 2)
         query = _split_heads(jnp.einsum("...ad,ade->...ae", x, self.query.weight) + self.query.bias)
-        # Returns are predicted where float64 is on. With a probability in float32, the random draws are the same there.
+        # Returns are predicted with float64 on. A probability in float32 gives them the same draws as rewards have.
         coins = jax.random.bernoulli(mask_key, jnp.float32(0.5), (COALITIONS, agents, agents))
         mask = coins | jnp.eye(agents, dtype=bool)
 
@@ -119,12 +117,12 @@ class Coalitions(eqx.Module):
             weights: Float[Array, "rows masks queries agents"],
         ) -> Float[Array, "rows outputs queries agents"]:
             if dropout_key is not None:
-                return dropout(weights, dropout_keys[0])
+                return dropout(weights, dropout_keys[0], DROPOUT)
             # Without dropout, what follows is linear: the mean over coalitions costs least here.
             return jnp.mean(weights, axis=1, keepdims=True)
 
         attention = attend(query, _split_heads(self.key(x)), _split_heads(self.value(x)), mask, transform)
-        merged = dropout(self.merge(attention), dropout_keys[1])
+        merged = dropout(self.merge(attention), dropout_keys[1], DROPOUT)
         return jnp.mean(merged.reshape(*x.shape[:-2], -1, *x.shape[-2:]), axis=-3)
 
 
@@ -134,8 +132,7 @@ class STAS(eqx.Module):
     embed: Linear
     """Embeds the observation and the one-hot action."""
     position: Float[Array, "steps size"]
-    agent_number: Float[Array, "agents size"]
-    """The index embeddings of agents."""
+    index_embeddings: Float[Array, "agents size"]
     layers: tuple[TimeLayer, ...]
     coalitions: Coalitions
     head: Linear
@@ -146,7 +143,7 @@ class STAS(eqx.Module):
         embed_key, position_key, number_key, layers_key, coalitions_key, head_key = jax.random.split(key, 6)
         self.embed = Linear(spec.n_inputs, SIZE, key=embed_key)
         self.position = jax.random.normal(position_key, (spec.max_steps, SIZE))
-        self.agent_number = jax.random.normal(number_key, (spec.agents, SIZE))
+        self.index_embeddings = jax.random.normal(number_key, (spec.agents, SIZE))
         self.layers = tuple(TimeLayer(key=key) for key in jax.random.split(layers_key, LAYERS))
         self.coalitions = Coalitions(spec.agents, key=coalitions_key)
         self.head = Linear(SIZE, 1, key=head_key)
@@ -173,5 +170,5 @@ class STAS(eqx.Module):
         self, x: Float[Array, "episodes steps agents size"], key: PRNGKeyArray, dropout_key: PRNGKeyArray | None
     ) -> Float[Array, "episodes steps agents"]:
         """Return the agents' rewards for one sample of coalitions and of the order of index embeddings."""
-        x = self.coalitions(x, self.agent_number, key, dropout_key)
+        x = self.coalitions(x, self.index_embeddings, key, dropout_key)
         return self.output_scale * self.head(x)[..., 0]

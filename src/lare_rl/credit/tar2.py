@@ -39,8 +39,7 @@ class TAR2(eqx.Module):
     embed_observation: Linear
     embed_action: Linear
     position: Float[Array, "steps size"]
-    agent_numbers: Float[Array, "layers agents size"]
-    """Embeddings of agent numbers."""
+    index_embeddings: Float[Array, "layers agents size"]
     time_layers: tuple[TimeLayer, ...]
     agent_layers: tuple[Coalitions, ...]
     contribution_model: MLP
@@ -55,14 +54,14 @@ class TAR2(eqx.Module):
         self.embed_observation = Linear(n_observations, SIZE, key=keys[0])
         self.embed_action = Linear(n_actions, SIZE, key=keys[1])
         self.position = jax.random.normal(keys[2], (spec.max_steps, SIZE))
-        self.agent_numbers = jax.random.normal(keys[3], (LAYERS, spec.agents, SIZE))
+        self.index_embeddings = jax.random.normal(keys[3], (LAYERS, spec.agents, SIZE))
         self.time_layers = tuple(TimeLayer(SIZE, key=key) for key in jax.random.split(keys[4], LAYERS))
         self.agent_layers = tuple(Coalitions(spec.agents, SIZE, key=key) for key in jax.random.split(keys[5], LAYERS))
         self.contribution_model = MLP(2 * LAYERS * SIZE, (SIZE,), 1, key=keys[6], activation=gelu)
         self.action_model = MLP((1 + LAYERS) * SIZE, (SIZE,), n_actions, key=keys[7], activation=gelu)
 
     def __call__(self, inputs: Float[Array, "rows agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
-        """Return the contributions. Without a key, they are the mean over fixed samples of coalitions and agent numbers."""
+        """Return the contributions. Without a key, they are means over fixed samples of coalitions and orders of index embeddings."""
         shape = -1, len(self.position), inputs.shape[1]
         observation, action = jnp.split(inputs, [self.embed_observation.weight.shape[0]], axis=-1)
         state = self.embed_observation(observation).reshape(*shape, SIZE) + self.position[:, None]
@@ -83,12 +82,12 @@ class TAR2(eqx.Module):
     def _attend(
         self, x: Float[Array, "episodes steps agents size"], key: PRNGKeyArray
     ) -> Float[Array, "episodes steps agents stacked"]:
-        """Return the outputs of all layers, for one sample of coalitions and of agent numbers for each layer."""
+        """Return the outputs of all layers, for one sample of coalitions and of the order of index embeddings for each layer."""
         outputs = []
-        layers = self.time_layers, self.agent_layers, self.agent_numbers, jax.random.split(key, LAYERS)
-        for time_layer, agent_layer, numbers, layer_key in zip(*layers, strict=True):
+        layers = self.time_layers, self.agent_layers, self.index_embeddings, jax.random.split(key, LAYERS)
+        for time_layer, agent_layer, index_embeddings, layer_key in zip(*layers, strict=True):
             x = jnp.swapaxes(time_layer(jnp.swapaxes(x, 1, 2), None), 1, 2)
-            x = agent_layer(x, numbers, layer_key, None)
+            x = agent_layer(x, index_embeddings, layer_key, None)
             outputs.append(x)
         return jnp.concatenate(outputs, axis=-1)
 

@@ -36,7 +36,7 @@ def append_metrics(directory: Path, lines: Sequence[dict[str, Any]]) -> int:
     """Append lines to metrics.jsonl, and return the new size of the file in bytes. Raises `LareError` if that fails."""
     path = directory / METRICS_FILE
     with (
-        report_write_error(path, "; the last checkpoint is whole"),
+        report_write_error(path, "; the last checkpoint is intact"),
         path.open("a", encoding="utf-8", newline="\n") as file,
     ):
         file.write("".join(json.dumps(line) + "\n" for line in lines))

@@ -92,7 +92,7 @@ def compute_host_factors(run: Run, config: CreditConfig, steps: Trajectory) -> F
         except NonFiniteFactorError as error:
             path = run.directory / "failed_batch.npz"
             replace_npz(path, {"observation": error.observation, "action": error.action})
-            raise LareError(f"{error}; it was given the batch in {path}; the last checkpoint is whole") from error
+            raise LareError(f"{error}; it was given the batch in {path}; the last checkpoint is intact") from error
         factors[..., config.team_slice(i), : columns.shape[-1]] = columns
     return factors
 

@@ -10,7 +10,7 @@ from lare_rl.errors import LareError
 
 __all__ = ["DivergedError", "check_actions", "check_losses"]
 
-REMEDY = "the last checkpoint is whole: train again with a smaller learning rate"
+REMEDY = "train again with a smaller learning rate; the last checkpoint is intact"
 
 
 class DivergedError(LareError):
@@ -18,7 +18,7 @@ class DivergedError(LareError):
 
 
 def check_actions(action: Float[np.ndarray, "seeds *rest"], seeds: Sequence[int]) -> None:
-    """Raise `DivergedError` if the actions of a seed's policy are not finite."""
+    """Raise `DivergedError` if the actions of a seed's policy are not finite. Discrete ones always are: `check_losses` finds the error."""
     for seed, action_of_seed in zip(seeds, action, strict=True):
         if not np.isfinite(action_of_seed).all():
             raise DivergedError(f"training diverged: the policy of seed {seed} is not finite any more; {REMEDY}")
@@ -26,6 +26,7 @@ def check_actions(action: Float[np.ndarray, "seeds *rest"], seeds: Sequence[int]
 
 def check_losses(metrics: Mapping[str, Any], seeds: Sequence[int], step: int) -> None:
     """Raise `DivergedError` if a loss of a seed that has made updates is not finite. The metrics are arrays with a number for each seed."""
+    # Only QMIX and VDN count updates. The loss of a seed without updates is NaN.
     updates = np.asarray(metrics.get("algorithm/updates", np.ones(len(seeds))))
     for name in metrics:
         if not name.startswith(("critic/loss", "credit/loss")):
@@ -33,6 +34,5 @@ def check_losses(metrics: Mapping[str, Any], seeds: Sequence[int], step: int) ->
         for seed, loss, n_updates in zip(seeds, np.asarray(metrics[name]), updates, strict=True):
             if n_updates and not np.isfinite(loss):
                 raise DivergedError(
-                    f"training diverged: {name} of seed {seed} is not finite at step {step}; {REMEDY} (a JaxEnv may also have "
-                    "returned NaN)"
+                    f"training diverged, or a JaxEnv returned NaN: {name} of seed {seed} is not finite at step {step}; {REMEDY}"
                 )

@@ -193,7 +193,7 @@ class Session:
             compute_host_factors(self.run, self.config, steps)  # raises an error that names the factor
             raise LareError(
                 "a factor is finite in NumPy, and not in the compiled function: write phi without numbers that are too large for "
-                "float32; the last checkpoint is whole"
+                "float32; the last checkpoint is intact"
             )
 
     def _compile_while_collecting(self) -> None:
@@ -219,6 +219,7 @@ class Session:
             LareError: a policy, a loss or a factor is not finite, an environment fails, or the best policies cannot be written.
         """
         self._check_factors()
+        check_losses(self.latest_metrics, self.run.seeds, self.step)
         actor, n_episodes = self.actor, self.settings.evaluation_episodes
         evaluation = self.collector.evaluate(actor, n_episodes)
         if len(self.config.env.teams) == 1:
@@ -233,7 +234,6 @@ class Session:
             metrics |= team_metrics([{DETERMINISTIC_RETURN: mean} for mean in means.T], self.config.env.teams)
         if self.step > self.settings.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
             metrics[ACTOR_SATURATION] = saturation(greedy_actions(actor, self.learner.replay, self.config))
-        check_losses(self.latest_metrics, self.run.seeds, self.step)
         return metrics_lines(self.run.seeds, self.step, metrics, rate)
 
     def _keep_best(self, score: Float[np.ndarray, " seeds"], actor: Any) -> None:

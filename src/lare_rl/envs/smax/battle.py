@@ -12,7 +12,7 @@ A step of half a second has 8 ticks. In each tick, all units act at once, with t
 with d = |x_i - x_j| + 1e-6, over the pairs in which both are still alive.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +33,7 @@ __all__ = [
     "sample_cooldown_noise",
     "separate_units",
     "start_battle",
+    "within",
     "won",
 ]
 
@@ -96,7 +97,7 @@ def advance(
 
     def tick(battle: Battle, cooldown_noise: Float[Array, " units"]) -> tuple[Battle, None]:
         is_alive = alive(battle)
-        hits = aims & _within_reach(scenario, battle) & (battle.cooldown <= 0)[:, None]
+        hits = aims & within(scenario, battle, "attack_range") & (battle.cooldown <= 0)[:, None]
         damage = jnp.sum(jnp.where(hits, scenario.unit_stats("damage")[:, None], 0), axis=0)
         reloaded = scenario.unit_stats("cooldown") + cooldown_noise
         cooldown = jnp.where(jnp.any(hits, axis=1), reloaded, battle.cooldown - TICK)
@@ -130,10 +131,10 @@ def distances(position: Float[Array, "units 2"]) -> Float[Array, "units units"]:
     return jnp.sqrt((x[:, None] - x) ** 2 + (y[:, None] - y) ** 2)
 
 
-def _within_reach(scenario: Scenario, battle: Battle) -> Bool[Array, "units units"]:
-    """Return at [i, j] whether unit i could hit unit j: both are alive, and the distance is small enough."""
+def within(scenario: Scenario, battle: Battle, stat: Literal["attack_range", "sight"]) -> Bool[Array, "units units"]:
+    """Return at [i, j] whether unit j is within the range of unit i, and both are alive."""
     is_alive = alive(battle)
-    return (distances(battle.position) < scenario.unit_stats("attack_range")[:, None]) & is_alive[:, None] & is_alive
+    return (distances(battle.position) < scenario.unit_stats(stat)[:, None]) & is_alive[:, None] & is_alive
 
 
 def separate_units(
@@ -154,7 +155,7 @@ def available_actions(scenario: Scenario, battle: Battle) -> Bool[Array, "allies
     """Return the available actions of our units. Dead units can only stop; others can attack enemies within their reach."""
     is_alive = alive(battle)[: scenario.n_allies, None]
     move = jnp.repeat(is_alive, len(DIRECTIONS), axis=1)
-    attack = _within_reach(scenario, battle)[: scenario.n_allies, scenario.n_allies :]
+    attack = within(scenario, battle, "attack_range")[: scenario.n_allies, scenario.n_allies :]
     return jnp.concatenate([move, jnp.ones_like(is_alive), attack], axis=1)
 
 

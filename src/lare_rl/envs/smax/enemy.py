@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lare_rl.envs.smax.battle import ATTACK, DIRECTIONS, FIELD, STOP, Battle, alive
+from lare_rl.envs.smax.battle import ATTACK, DIRECTIONS, FIELD, STOP, Battle, alive, distances, within
 from lare_rl.envs.smax.scenarios import Scenario
 
 __all__ = ["Memory", "choose_actions", "init_memory"]
@@ -38,11 +38,9 @@ def choose_actions(
 ) -> tuple[Int[Array, " enemies"], Memory]:
     """Return the action of each enemy unit. Its attacks count the allies from the last to the first."""
     n_allies, is_alive = scenario.n_allies, alive(battle)
-    reach, sight = (scenario.unit_stats(stat)[n_allies:, None] for stat in ("attack_range", "sight"))
+    visible, in_reach = (within(scenario, battle, stat)[n_allies:, :n_allies] for stat in ("sight", "attack_range"))
+    distance = distances(battle.position)[n_allies:, :n_allies]
     offset = battle.position[:n_allies] - battle.position[n_allies:, None]
-    distance = jnp.sqrt(jnp.sum(offset**2, axis=-1))
-    visible = (distance < sight) & is_alive[n_allies:, None] & is_alive[:n_allies]
-    in_reach = visible & (distance < reach)
 
     previous = jax.nn.one_hot(memory.attacked, n_allies, dtype=bool)  # no unit for -1
     keeps = jnp.any(previous & in_reach, axis=1)

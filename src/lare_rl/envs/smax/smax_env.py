@@ -1,8 +1,9 @@
 """SMAX: StarCraft-like battles (Rutherford et al., JaxMARL, 2024) in JAX, as a `JaxEnv`.
 
-    reward = 10 * (mean over the enemy's units of the share of health lost in the step + 1 if the step won the battle)
+    reward = 10 * (harm + win)
 
-which is 10 times the reward of SMAX, so that the largest return of an episode is 20, as in SMAC (Samvelyan et al., 2019).
+harm is the mean share of their health that the enemy's units lose in the step; win is 1 in the step that wins the battle, else 0. This is
+10 times the reward of SMAX, so that the largest return of an episode is 20, as in SMAC (Samvelyan et al., 2019).
 """
 
 from typing import Any, NamedTuple
@@ -40,8 +41,8 @@ class SmaxState(NamedTuple):
 class SMAX:
     """A battle in which the agents are the units of one side. A `JaxEnv`.
 
-    The actions are up, right, down, left, stop, and one attack for each enemy unit. An action that is not available does nothing.
-    A unit that dies leaves. All living units receive the same reward: the reward of their side.
+    The actions are those of `battle.py`: four moves, stop, and one attack for each enemy unit. An attack that is not available hits if its
+    target comes into reach during the step. A unit that dies leaves. All living units receive the same reward: the reward of their side.
 
     >>> env = SMAX("2s3z")
     >>> state, timestep = env.reset(jax.random.key(0))
@@ -74,7 +75,7 @@ class SMAX:
     def step(
         self, state: SmaxState, action: Float[Array, "agents action"], key: PRNGKeyArray
     ) -> tuple[SmaxState, Timestep]:
-        """Make one step of half a second. Both sides choose from the same state."""
+        """Make one step. Both sides choose from the same state."""
         scenario, battle = self.scenario, state.battle
         enemy_key, noise_key = jax.random.split(key)
         enemy_action, memory = choose_actions(scenario, battle, state.memory, enemy_key)
@@ -100,7 +101,7 @@ class SMAX:
     def frames(self, states: SmaxState, credit: Float[np.ndarray, "steps agents"] | None = None) -> list[Frame]:
         from lare_rl.envs.smax.drawing import draw_frames
 
-        if credit is not None:  # all living units have the same credit, dead units none
+        if credit is not None:  # one number for a step: the team's credit or, if each unit has its own, the largest one
             credit = np.take_along_axis(credit, np.abs(credit).argmax(axis=1)[:, None], axis=1)[:, 0]
         return draw_frames(self.scenario, states.battle, credit)
 
@@ -122,28 +123,29 @@ def _one_hot_unit_types(scenario: Scenario) -> Float[np.ndarray, "units unit_typ
 def observe(scenario: Scenario, battle: Battle) -> Float[Array, "allies observation"]:
     """Return the observation of each of our units: all other units, ours first, and then the unit itself.
 
-    For another unit: health as a share, offset in units of the observer's sight (x, y), its last move (x, y), its last attack as a
-    share of its actions (0 for none), cooldown as a share between 0 and 1, type as one-hot; zeros if it is dead or not in sight.
+    For another unit: health as a share, offset in units of the observer's sight (x, y), its previous move (x, y), the number of its
+    previous action divided by the largest action number if that was an attack (else 0), cooldown as a share between 0 and 1, type as
+    one-hot; zeros if it is dead or not in sight.
     For the unit itself: health, position as a share of the field (x, y), cooldown, type. Dead units observe zeros.
     """
     n_allies, n_units = scenario.n_allies, scenario.n_units
     is_alive, unit_types = alive(battle), _one_hot_unit_types(scenario)
     health = (battle.health / scenario.unit_stats("health"))[:, None]
     cooldown = jnp.clip(battle.cooldown / scenario.unit_stats("cooldown"), 0, 1)[:, None]
-    last_action = ATTACK - 1 + np.where(scenario.is_enemy == 1, n_allies, scenario.n_enemies).astype(np.float32)
-    attack = (jnp.where(battle.action >= ATTACK, battle.action, 0) / last_action)[:, None]
+    largest_action = ATTACK - 1 + np.where(scenario.is_enemy == 1, n_allies, scenario.n_enemies).astype(np.float32)
+    attack = (jnp.where(battle.action >= ATTACK, battle.action, 0) / largest_action)[:, None]
 
     # Offsets differ between observers; all other values of a unit are the same for every observer.
     offset = battle.position - battle.position[:n_allies, None]
+    visible = rules.within(scenario, battle, "sight")[:n_allies]
     sight = scenario.unit_stats("sight")[:n_allies, None]
-    visible = (jnp.sqrt(jnp.sum(offset**2, axis=-1)) < sight) & is_alive[:n_allies, None] & is_alive
     action_and_type = jnp.concatenate([move_direction(battle.action), attack, cooldown, unit_types], axis=1)
     columns = [health[None], offset / sight[..., None], action_and_type[None]]
     other_units = jnp.concatenate(
         [jnp.broadcast_to(column, (n_allies, n_units, column.shape[-1])) for column in columns], axis=2
     )
     other_units = jnp.where(visible[..., None], other_units, 0)
-    # Leave out the observer itself: its column and all later columns hold the next unit.
+    # Leave out the observer itself: from its place on, each place holds the next unit.
     is_before = np.arange(n_units - 1) < np.arange(n_allies)[:, None]
     other_units = jnp.where(is_before[..., None], other_units[:, :-1], other_units[:, 1:])
 
