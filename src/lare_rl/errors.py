@@ -18,6 +18,7 @@ __all__ = [
     "CheckedModel",
     "Count",
     "LareError",
+    "abbreviate",
     "check_count",
     "did_you_mean",
     "find_named",
@@ -64,13 +65,18 @@ def missing_extra_error(feature: str, extra: str) -> LareError:
     return LareError(f"{feature} needs an extra: {install_command(extra)}")
 
 
+def abbreviate(text: str, length: int) -> str:
+    """Return a text, or its first characters and dots if it is longer than `length`."""
+    return text if len(text) <= length else f"{text[:length]}..."
+
+
 def short_repr(value: Any) -> str:
     """Return the repr of a value, cut to fit into a line."""
     try:
         text = " ".join(map(str.strip, repr(value).splitlines()))  # arrays have several lines
     except Exception:  # the value may be nested too deep, or of a class whose repr fails
         return f"a {type(value).__name__} that cannot be shown"
-    return text if len(text) <= MAX_REPR else f"{text[:MAX_REPR]}..."
+    return abbreviate(text, MAX_REPR)
 
 
 def did_you_mean(name: str, known_names: Iterable[str]) -> str:

@@ -91,16 +91,17 @@ def test_few_seeds_establish_no_difference(n_seeds, n_episodic, is_hedged):
 
 
 @pytest.mark.parametrize(
-    ("final", "code"),
+    ("final", "random_error", "code"),
     [
-        (10.1, "learned"),
-        (9.9, "may_beat_random"),
-        (-10.1, "worse_than_random"),
+        (10.1, 3, "learned"),
+        (9.9, 3, "may_beat_random"),
+        (-10.1, 3, "worse_than_random"),
+        (7.9, 0.1, "may_beat_random"),  # far above all random returns, and yet not clearly
     ],
 )
-def test_outcome_by_standard_errors(final, code):
+def test_outcome_by_standard_errors(final, random_error, code):
     """Two errors of 3 and 4 make one of 5, so two standard errors are 10."""
-    findings = find(np.full((1, 8), final), random_returns=3 * np.sqrt(3) * RANDOM, episode_error=4.0)
+    findings = find(np.full((1, 8), final), random_returns=random_error * np.sqrt(3) * RANDOM, episode_error=4.0)
     assert next(iter(findings)) == code
 
 

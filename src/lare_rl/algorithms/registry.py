@@ -7,8 +7,8 @@ module of its functions, which is imported when the algorithm is first used. The
     ROLLOUTS       init, get_actor, act, explore, update                  as in `ppo/ppo.py`
     SEQUENCES      init, get_actor, act, init_memory, epsilon, update     as in `qmix/qmix.py`
 
-`update` returns metrics: those whose names begin with `actor/` or `critic/` say that the policy was updated, and `critic/loss` must be
-finite.
+`update` returns the new state and metrics. Metrics whose names begin with `actor/` or `critic/` say that the policy was updated, and
+`critic/loss` must be finite.
 
 `lare-rl export` also writes the result of `logits(actor, observation, available)`, if the module has this function.
 """
@@ -92,7 +92,8 @@ class Algorithm:
     """The module with the functions that the training loop calls (see above)."""
     run_defaults: "Callable[[EnvSpec, int | None], dict[str, Any]]"
     """Maps an environment, and the number of its copies if the user chose one, to the defaults of `Settings` by name.
-    `evaluate_iterations` may stand for `evaluate_every`, and counts iterations. `credit` holds only the settings that differ."""
+    `evaluate_iterations` may stand for `evaluate_every`, and counts iterations. `credit` holds only the settings that differ from
+    `MULTI_AGENT_CREDIT` (if `multi_agent`) or from `CreditSettings()`."""
     summary: str
     source: str
     continuous: bool = True
@@ -116,13 +117,13 @@ class Algorithm:
             return Noise.UNIFORM
         return Noise.GUMBEL if discrete else Noise.NORMAL
 
-    def deterministic_evaluation(self, discrete: bool) -> bool:
+    def deterministic_evaluation(self, discrete: bool, n_agents: int) -> bool:
         """Return whether a policy acts without noise outside training.
 
         A policy that is trained on rollouts is a distribution. Until it is nearly deterministic, its mode can earn far less than its
         samples. Only the continuous actions of a single agent are taken at the mode.
         """
-        return self.consumes is not Consumes.ROLLOUTS or not (discrete or self.multi_agent)
+        return self.consumes is not Consumes.ROLLOUTS or not (discrete or n_agents > 1)
 
 
 ALGORITHMS = Registry[Algorithm]("algorithm")
@@ -131,8 +132,8 @@ ALGORITHMS = Registry[Algorithm]("algorithm")
 def register_algorithm(algorithm: Algorithm) -> None:
     """Add an algorithm. Its name then works in `Settings(algorithm=...)` and on the command line.
 
-    Raises `LareError` if another algorithm has this name, if its settings or `consumes` are of the wrong class, or
-    if it promises what no algorithm can do that consumes such data.
+    Raises `LareError` if another algorithm has this name, if its settings or `consumes` are of the wrong class, or if it promises what no
+    algorithm that consumes such data can do.
     """
     from lare_rl.algorithms.off_policy import OffPolicySettings  # here, because that module imports this one
 
@@ -152,4 +153,6 @@ def register_algorithm(algorithm: Algorithm) -> None:
         raise LareError(f"{trains} one agent with continuous actions: pass discrete=False, multi_agent=False")
     if algorithm.consumes is Consumes.SEQUENCES and algorithm.continuous:
         raise LareError(f"{trains} discrete actions: pass continuous=False")
+    if algorithm.consumes is not Consumes.ROLLOUTS and algorithm.multi_team:
+        raise LareError(f"{trains} one team: pass multi_team=False")
     ALGORITHMS.register(algorithm.name, algorithm)

@@ -109,7 +109,7 @@ def _prepare(
     for name, warning in describe_unused_settings(settings, resolved, spec).items():
         # The configuration of a repeated run holds every setting, so a setting without effect is no mistake of the user.
         if not (plan.is_run and plan.has_same_value(name, settings)):
-            raise LareError(f"{warning}: leave the setting out")
+            raise LareError(f"leave {name} out: {warning}")
     files = function or plan.function_for(resolved)
     functions = _load_functions(files, spec, resolved) if files else None
     out = out or default_directory(spec, resolved)

@@ -75,9 +75,9 @@ def unused_names(settings: ResolvedSettings) -> list[str]:
 
 
 def fits_separately(method: Method, consumes: Consumes) -> bool:
-    """Return whether the gradient updates of the decoder run between iterations. Else each update of the algorithm has one.
+    """Return whether the decoder makes its gradient updates in a step of their own, before those of the algorithm.
 
-    A decoder's own loss is too expensive for every update of the algorithm.
+    Otherwise, a decoder with gradient updates makes one with each update of the algorithm. Its own loss would be too expensive for that.
     """
     return method.uses_gradient and (consumes is Consumes.ROLLOUTS or method.fit is Fit.DECODER_LOSS)
 

@@ -115,8 +115,11 @@ def _normalise(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Reso
     changes = {}
     if resolved.scored_observation == task.scored_observation:
         changes["scored_observation"] = None
-    if "first_fit" in unused_names(resolved):
+    unused = unused_names(resolved)
+    if "first_fit" in unused:
         changes["first_fit"] = None
+    if "scale_rewards" in unused:
+        changes["scale_rewards"] = False
     score, method = resolved.credit.score, METHODS.find(resolved.method)
     if score == "auto":
         score = find_score_type(task) or score

@@ -175,7 +175,7 @@ class TrainConfig(CreditConfig):
         """Whether the policy acts without noise outside training."""
         if self.deterministic is not None:
             return self.deterministic
-        return self.algorithm.deterministic_evaluation(self.env.discrete)
+        return self.algorithm.deterministic_evaluation(self.env.discrete, self.env.n_agents)
 
     @property
     def noise_size(self) -> int:
@@ -194,7 +194,7 @@ class TrainConfig(CreditConfig):
 
     @property
     def fits_separately(self) -> bool:
-        """Whether the decoder makes gradient updates of its own, between iterations."""
+        """See `fits_separately` of `config/effective.py`."""
         return fits_separately(self.method, self.consumes)
 
     @property

@@ -24,7 +24,7 @@ from lare_rl.credit.closed_form import ClosedForm
 from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.linear_decoder import LinearDecoder
 from lare_rl.credit.methods import Fit
-from lare_rl.credit.prequential import Predictions, add_predictions
+from lare_rl.credit.prequential import RETURN_TOLERANCE, Predictions, add_predictions
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate, compare_score_types, is_better, score_type_errors
 from lare_rl.credit.spec import CreditSpec
 
@@ -238,8 +238,7 @@ def find_score_mismatch(state: DecoderState, spec: CreditSpec) -> Literal["looks
     returns = np.sort(np.asarray(state.predictions.returns)[:n_returns])
     if spec.method.fit is not Fit.EVIDENCE or n_returns < MIN_BINARY_RETURNS or returns[0] == returns[-1]:
         return None
-    # A return is stored as the mean reward of a step, so equal returns of unlike lengths differ in their last digits.
-    gaps = np.diff(returns) > 1e-5 * max(abs(returns[0]), abs(returns[-1]))
+    gaps = np.diff(returns) > RETURN_TOLERANCE * max(abs(returns[0]), abs(returns[-1]))
     has_two_values = int(gaps.sum()) == 1
     if has_two_values == (ScoreType.LOG_ODDS in spec.score_types):
         return None

@@ -9,14 +9,14 @@ Jordan, *Bayesian parameter estimation via variational methods*, Statistics and 
 
     lambda_k = tanh(xi_k / 2) / (2 xi_k),     z_k = (won_k - 1/2) / lambda_k,     xi_k^2 = eta_k^2 + var(eta_k)
 
-Under the bound, w is the weight of a regression of z on x in which episode k has the noise precision lambda_k. So each round is a
-round of `evidence.py` with known noise, and none makes the bound worse. Unlike Laplace's approximation it needs no step size, even
-if the episodes can be separated.
+This lambda is twice theirs. Under the bound, w is the weight of a regression of z on x in which episode k has the noise precision
+lambda_k. So each round is a round of `evidence.py` with known noise. While alpha stays the same, no round makes the bound worse. Unlike
+Laplace's approximation it needs no step size, even if a plane separates the won from the lost episodes.
 
 The fit reads the last `WINDOW` episodes, because it needs their features again in each round, and not only sums over them.
 
-Proxy rewards are in the unit of the return: a step is paid c w . f_t, where R = a + c w . x is the regression of the expected returns
-on what steps add to the log odds.
+Proxy rewards are in the unit of the return: a step is paid slope w . f_t, where R = start_value + slope w . x is the
+regression of the expected returns on what steps add to the log odds.
 """
 
 from typing import NamedTuple
@@ -27,8 +27,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import evidence
 from lare_rl.credit.evidence import JAX_BACKEND, PosteriorCovariance
-from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, AlphaIndex, Posterior, varies
-from lare_rl.credit.prequential import ring_slots
+from lare_rl.credit.precisions import JITTER, AlphaIndex, Posterior, varies
+from lare_rl.credit.prequential import RETURN_TOLERANCE, ring_slots
 
 __all__ = [
     "WINDOW",
@@ -46,20 +46,20 @@ __all__ = [
 WINDOW = 512
 """The number of last episodes that are fitted."""
 XI_TOLERANCE = 1e-3
-"""The iteration ends when no log odds change by more than this."""
+"""The iteration ends when no xi changes by more than this."""
 
 
 class LogOddsFit(NamedTuple):
     """The last episodes, in no particular order, and the fit to them."""
 
     columns: Float[Array, "window columns"]
-    """The sums of each episode's features, and which level it has."""
+    """For each episode: the sums of its features, 0 in the column of 1/T if the basis has one, and its level, one-hot."""
     returns: Float[Array, " window"]
     n_episodes: Float[Array, ""]
     """The number of episodes that were ever added."""
     lowest: Float[Array, ""]
     highest: Float[Array, ""]
-    """The range of all returns so far, which is that of the score. The last episodes may all be won."""
+    """The range of all returns so far, which is that of the score. The last episodes may all be won. Equal values are no range."""
     posterior: Posterior
     """In units of log odds."""
     root: Float[Array, "columns columns"]
@@ -116,20 +116,21 @@ _State = tuple[Int[Array, ""], Float[Array, ""], Float[Array, " window"], Poster
 def fit(state: LogOddsFit, alpha_index: AlphaIndex, max_rounds: int | Int[Array, ""]) -> LogOddsFit:
     """Fit to the episodes, from the precisions of the last fit. Call this with float64 enabled.
 
-    Returns are divided into won and lost halfway between the lowest and the highest. While all episodes are won, or all are lost, nothing
-    changes.
+    Returns are divided into won and lost halfway between the lowest and the highest. While all episodes are won, or all are lost, or all
+    returns are equal but for rounding errors, nothing changes.
     """
     valid, low, high = _valid_range(state)
     n_episodes = jnp.maximum(jnp.sum(valid), 1)
     x = jnp.where(valid[:, None], state.columns, 0).astype(float)
     won = (state.returns > (low + high) / 2).astype(float)
     is_mixed = jnp.any(valid & (won > 0)) & jnp.any(valid & (won == 0))
+    is_mixed &= high - low > RETURN_TOLERANCE * jnp.maximum(jnp.abs(low), jnp.abs(high))
     squares = jnp.sum(jnp.where(valid[:, None], x - jnp.sum(x, axis=0) / n_episodes, 0) ** 2, axis=0)
+    # The rounding errors of sums that cancel are as large as those of other sums: one size serves for all columns.
     is_used = varies(squares / n_episodes, jnp.sum(x**2) / (n_episodes * x.shape[1]))
     x = jnp.where(is_used, x, 0)
     # By this alpha, all groups together change the log odds of an episode by about 1.
     equal_alpha = JAX_BACKEND.equal_alpha(jnp.where(is_used, squares, 0), 2 * n_episodes, alpha_index)
-    limits = equal_alpha / PRIOR_RANGE, equal_alpha * PRIOR_RANGE
 
     def body(carry: _State) -> _State:
         n_rounds, _, xi, posterior, _ = carry
@@ -146,16 +147,14 @@ def fit(state: LogOddsFit, alpha_index: AlphaIndex, max_rounds: int | Int[Array,
         weight = (root @ (weighted.T @ (target - target_mean))) @ root
         eta = target_mean + difference @ weight
         variance = jnp.sum((difference @ root.T) ** 2, axis=1) + 1 / total
-        moments = weight, jnp.sum(root**2, axis=0), log_det
-        n_effective, alpha, log_occam = JAX_BACKEND.update_alpha(alpha_index, alpha, *moments)
-        likelihood = jnp.sum(jnp.where(valid, jax.nn.log_sigmoid((2 * won - 1) * eta), 0))
+        n_effective, alpha, _ = JAX_BACKEND.update_alpha(alpha_index, alpha, weight, jnp.sum(root**2, axis=0), log_det)
         posterior = Posterior(
             weight=weight,
             bias=target_mean - x_mean @ weight,
-            alpha=jnp.clip(alpha, *limits),
-            beta=jnp.ones(()),
+            alpha=JAX_BACKEND.clip_alpha(alpha, equal_alpha),
+            beta=jnp.ones(()),  # no noise is fitted: 1 says that there is a fit
             n_effective=n_effective,
-            log_evidence=likelihood + log_occam,
+            log_evidence=jnp.zeros(()),
         )
         new_xi = jnp.sqrt(eta**2 + variance)
         change = jnp.max(jnp.where(valid, jnp.abs(new_xi - xi), 0))
@@ -164,7 +163,7 @@ def fit(state: LogOddsFit, alpha_index: AlphaIndex, max_rounds: int | Int[Array,
     def is_unsettled(carry: _State) -> Bool[Array, ""]:
         return (carry[0] < max_rounds) & (carry[1] > XI_TOLERANCE)
 
-    alpha = jnp.where(state.posterior.has_fit, jnp.clip(state.posterior.alpha, *limits), equal_alpha)
+    alpha = jnp.where(state.posterior.has_fit, JAX_BACKEND.clip_alpha(state.posterior.alpha, equal_alpha), equal_alpha)
     start = state.posterior._replace(alpha=alpha)
     initial = (jnp.array(0), jnp.array(jnp.inf), jnp.ones(WINDOW), start, state.root)
     initial = jax.tree.map(lambda leaf: leaf.astype(float) if leaf.dtype == jnp.float32 else leaf, initial)
@@ -174,13 +173,16 @@ def fit(state: LogOddsFit, alpha_index: AlphaIndex, max_rounds: int | Int[Array,
 
 
 def predict(state: LogOddsFit, columns: Float[Array, "episodes columns"]) -> Float[Array, " episodes"]:
-    """Return the expected return of episodes, by the sums of their features. It is NaN without a fit."""
+    """Return the expected return of episodes, by the sums of their features. It is NaN before the first episode."""
     _, low, high = _valid_range(state)
     return low + (high - low) * jax.nn.sigmoid(state.posterior.bias + columns @ state.posterior.weight)
 
 
 def to_returns(state: LogOddsFit) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return a and c of R = a + c w . x, by a regression of the expected returns of the episodes, which have no noise."""
+    """Return the start value and the slope of R = start_value + slope w . x.
+
+    They are those of a regression of the episodes' expected returns, which have no noise.
+    """
     valid, _, _ = _valid_range(state)
     n_episodes = jnp.maximum(jnp.sum(valid), 1)
     log_odds = jnp.where(valid, state.posterior.bias + state.columns @ state.posterior.weight, 0)
@@ -193,7 +195,7 @@ def to_returns(state: LogOddsFit) -> tuple[Float[Array, ""], Float[Array, ""]]:
 
 
 def from_linear(state: LogOddsFit, linear: Float[Array, " episodes"]) -> Float[Array, " episodes"]:
-    """Return the expected returns of episodes by their linear predictions a + c w . x (see `to_returns`)."""
+    """Return the expected returns of episodes by their linear predictions start_value + slope w . x (see `to_returns`)."""
     (start_value, slope), (_, low, high) = to_returns(state), _valid_range(state)
     log_odds = state.posterior.bias + (linear - start_value) / jnp.where(slope == 0, 1, slope)
     return jnp.where(slope == 0, linear, low + (high - low) * jax.nn.sigmoid(log_odds))

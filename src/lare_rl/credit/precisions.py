@@ -65,7 +65,8 @@ class Posterior(NamedTuple):
     n_effective: Float[Array, "*batch alphas"]
     """gamma: for each alpha, how many of its features the data determine."""
     log_evidence: Float[Array, "*batch"]
-    """The log evidence of the precisions of this round, up to a constant that does not depend on groups and precisions."""
+    """The log evidence of the precisions of this round, up to a constant that does not depend on groups and precisions. 0 in
+    `logistic.py`."""
 
     @property
     def has_fit(self) -> Bool[Array, "*batch"]:
@@ -125,11 +126,15 @@ class Backend(NamedTuple):
         trace = self.sum_by_alpha(diagonal, alpha_index)
         return self.xp.where(trace > 0, 2 * len(trace) * trace / q, 1)
 
+    def clip_alpha(self, alpha: Alphas, equal_alpha: Alphas) -> Alphas:
+        """Clip alpha to `PRIOR_RANGE` around equal shares."""
+        return self.xp.clip(alpha, equal_alpha / PRIOR_RANGE, equal_alpha * PRIOR_RANGE)
+
     def clip_precisions(self, problem: Regression, alpha: Alphas, beta: Any) -> tuple[Alphas, Any]:
-        """Clip alpha to `PRIOR_RANGE` around equal shares, and beta to noise from `MIN_NOISE` of the variation to twice all of it."""
+        """Clip alpha, and beta to noise from `MIN_NOISE` of the variation to twice all of it."""
         xp = self.xp
         noise_only = xp.maximum(problem.dof, 1) / problem.q  # beta if all variation is noise
-        alpha = xp.clip(alpha, problem.equal_alpha / PRIOR_RANGE, problem.equal_alpha * PRIOR_RANGE)
+        alpha = self.clip_alpha(alpha, problem.equal_alpha)
         return alpha, xp.clip(beta, noise_only / 2, noise_only / MIN_NOISE)
 
     def inverse_root(self, precision: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Any]:

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 __all__ = [
     "LITTLE_R2",
     "MIN_R2_EPISODES",
+    "RETURN_TOLERANCE",
     "SEGMENT_WINDOW",
     "WINDOW",
     "Predictions",
@@ -38,6 +39,9 @@ SEGMENT_WINDOW = 256
 """The same for payments, if there are several in an episode, and for scores that are won or lost."""
 MIN_R2_EPISODES = 8
 """With fewer episodes, R^2 is NaN."""
+RETURN_TOLERANCE = 1e-5
+"""Returns that differ by less than this part of the larger one are equal. A return is stored as the mean reward of a step, so equal returns
+of unlike lengths differ in their last digits."""
 LITTLE_R2 = 0.1
 """Proxy rewards, or factors, explain next to nothing of the score if R^2 of the returns is lower."""
 

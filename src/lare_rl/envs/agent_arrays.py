@@ -10,11 +10,11 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete
 from jaxtyping import Bool, Float
 
-from lare_rl.envs.interface import EnvSpec, Team
+from lare_rl.envs.interface import AnyArray, EnvSpec, Team
 from lare_rl.envs.spaces import check_spaces, flatten_value, float_array
 from lare_rl.errors import LareError, short_repr
 
-__all__ = ["Agent", "AgentArrays", "integer_dtype", "make_agent"]
+__all__ = ["Agent", "AgentArrays", "fallback_state", "integer_dtype", "make_agent"]
 
 MASK = "action_mask"
 """PettingZoo's key for the mask of available actions, in the observation's dictionary or in `info`."""
@@ -93,6 +93,13 @@ def make_agent(name: Any, observation: gymnasium.Space, action: gymnasium.Space)
     if isinstance(action, Box) and observes_mask:
         raise LareError(f"{name} has an action mask, but its actions are not discrete: {short_repr(action)}")
     return Agent(name, observation, action, observes_mask)
+
+
+def fallback_state(
+    observations: Float[AnyArray, "agents observation"], credit_from_state: bool
+) -> Float[AnyArray, " state"]:
+    """Return the state of an environment that has none: all observations if credit is assigned from the state, else nothing."""
+    return observations.ravel() if credit_from_state else observations.ravel()[:0]
 
 
 class AgentArrays:

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.envs.interface import EnvSpec, Timestep
-from lare_rl.errors import LareError, install_command, short_repr
+from lare_rl.errors import LareError, abbreviate, install_command, short_repr
 from lare_rl.tasks.spec import MAX_LEVELS, TaskSpec
-from lare_rl.util.sanitize import abbreviate
+from lare_rl.util.sanitize import one_line
 
 __all__ = [
     "EnvOutputError",
@@ -46,7 +46,7 @@ def as_lare_error(message: str, error: BaseException, hint: str = "") -> LareErr
     if isinstance(error, LareError):
         return error
     logging.getLogger(__name__).debug("%s", message, exc_info=error)
-    text = " ".join(str(error).split())
+    text = one_line(error)
     if not text or isinstance(error, KeyError):  # its text is only the key
         text = f"{type(error).__name__} {text}".rstrip()
     return LareError(f"{message}: {abbreviate(text, MAX_ERROR)}{hint}")

@@ -72,7 +72,10 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
 
 
 class GymnasiumEnv:
-    """A Gymnasium environment as a `HostEnv`. Its values are checked, but they may be infinite or NaN (`check_finite`)."""
+    """A Gymnasium environment as a `HostEnv`.
+
+    Its values are checked, but infinite values and NaN pass: `VecEnv` refuses them (`check_finite`).
+    """
 
     def __init__(self, task: TaskSpec, **kwargs: Any):
         """Make the environment of a task. See `gymnasium.make` for the keyword arguments.

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.envs import jax_packages
-from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
+from lare_rl.envs.agent_arrays import Agent, AgentArrays, fallback_state, make_agent
 from lare_rl.envs.env_errors import NoTimeLimitError, one_line_errors
 from lare_rl.envs.interface import Timestep, with_available_action
 from lare_rl.envs.pettingzoo_construct import group_by_team
@@ -142,12 +142,12 @@ class JaxMARLEnv:
         return jnp.concatenate([padded, jnp.eye(len(vectors))], axis=1) if layout.adds_index else padded
 
     def _read_state(self, observations: Mapping[Any, Any], state: Any) -> Float[Array, " state"]:
-        """Return the global state. If there is none: all observations if credit is assigned from the state, else nothing."""
+        """Return the global state, or `fallback_state`."""
         if WORLD_STATE in observations:
             return jax_packages.flatten_tree(observations[WORLD_STATE])
         if hasattr(self.env, "get_world_state"):
             return jax_packages.flatten_tree(self.env.get_world_state(state))
-        return self._pad(observations).ravel() if self._credit_from_state else jnp.zeros(0)
+        return fallback_state(self._pad(observations), self._credit_from_state)
 
     def _read_masks(self, state: JaxMARLState) -> Bool[Array, "agents action"]:
         available = jnp.asarray(self.layout.available)

@@ -1,6 +1,6 @@
 """A PettingZoo environment as a `HostEnv`: `pettingzoo/MODULE:NAME`, where NAME makes a ParallelEnv.
 
-Agents and spaces are checked once, values at each step. They may be infinite or NaN (`check_finite`).
+Spaces are checked once, agents and values at each step. Infinite values and NaN pass: `VecEnv` refuses them (`check_finite`).
 """
 
 import logging
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
+from lare_rl.envs.agent_arrays import Agent, AgentArrays, fallback_state, make_agent
 from lare_rl.envs.env_errors import (
     EnvOutputError,
     NoTimeLimitError,
@@ -21,7 +21,7 @@ from lare_rl.envs.env_errors import (
     read_measures,
     to_float,
 )
-from lare_rl.envs.interface import Timestep
+from lare_rl.envs.interface import Timestep, with_available_action
 from lare_rl.envs.pettingzoo_construct import find_time_limit, group_by_team, make_parallel_env
 from lare_rl.envs.spaces import float_array
 from lare_rl.errors import LareError, short_repr
@@ -44,8 +44,8 @@ def make(task: TaskSpec, render_mode: str | None = None) -> "ParallelHost":
 class ParallelHost:
     """A ParallelEnv as a `HostEnv`. Each agent has a fixed index, no matter which agents act.
 
-    An agent that leaves while others stay observes zeros from then on. At an episode's last step no agent leaves: those that acted
-    observe the result, because `phi` may read it.
+    An agent that leaves while others stay observes zeros from then on. At an episode's last step, the agents that acted observe the result,
+    because `phi` may read it; but agents that terminate when an episode is truncated observe zeros.
     """
 
     def __init__(self, environment: Any, task: TaskSpec):
@@ -56,7 +56,9 @@ class ParallelHost:
         self.environment, self._task, self._label = environment, task, f"environment {task.environment!r}"
         names = list(environment.possible_agents or ())
         if not names or len(set(names)) != len(names):
-            raise LareError(f"{self._label} has possible agents {short_repr(names)}. Each needs a name.")
+            raise LareError(
+                f"{self._label} must have one possible agent or more, each with a name of its own, not {short_repr(names)}"
+            )
         names, teams = group_by_team(names, task)
         try:
             with one_line_errors("its spaces cannot be read"):
@@ -124,16 +126,17 @@ class ParallelHost:
             truncated[index] = self._read("truncation", truncations, agent, to_float, required)
         self._departed |= self._present & (terminated | truncated)  # some environments still list such agents
 
-        alive = self._present & ~self._departed
-        ended = not alive.any()
+        acts = self._present & ~self._departed
+        ended = not acts.any()
         was_truncated = ended and bool((acted & truncated & ~terminated).any())
-        observes = alive
+        observes = acts
         if ended:
+            # After truncation, the values of the agents that observe are bootstrapped, and an agent that terminated has no value.
             observes = acted & [agent.name in observations for agent in agents] & ~(was_truncated & terminated)
         reached_limit = not ended and self._steps >= self.spec.max_steps
-        self._alive = alive & (not reached_limit)  # after the last step, `step` refuses to go on
+        self._alive = acts & (not reached_limit)  # after the last step, `step` refuses to go on
         return self._make_timestep(
-            observations, infos, reward, observes, alive, ended and not was_truncated, was_truncated or reached_limit
+            observations, infos, reward, observes, acts, ended and not was_truncated, was_truncated or reached_limit
         )
 
     def render(self) -> Any:
@@ -206,13 +209,13 @@ class ParallelHost:
                         )
                     available[index, : agent.action_size] = mask
             elif self.layout.discrete:
-                available[index] = np.arange(self.layout.action_size) == 0
+                available[index] = False
         observation = self.layout.pad_observations(vectors)
         last, reports = terminated or truncated, [info for info in infos.values() if isinstance(info, Mapping)]
         return Timestep(
             observation=observation,
             state=self._read_state(observation),
-            available=available,
+            available=with_available_action(available),
             alive=observes.copy(),
             reward=float_array(reward),
             terminated=np.array(terminated),
@@ -221,12 +224,10 @@ class ParallelHost:
         )
 
     def _read_state(self, observation: Float[np.ndarray, "agents observation"]) -> Float[np.ndarray, " state"]:
-        """Return the environment's state. If it has none: all observations if credit is assigned from the state, else nothing."""
+        """Return the environment's state, or `fallback_state`."""
         if self._initialising or self._state is not None:
             self._update_state()
-        if self._state is not None:
-            return self._state.ravel()
-        return observation.ravel() if self._credit_from_state else np.zeros(0, np.float32)
+        return fallback_state(observation, self._credit_from_state) if self._state is None else self._state.ravel()
 
     def _update_state(self) -> None:
         if not callable(getattr(self.environment, "state", None)):
@@ -239,7 +240,7 @@ class ParallelHost:
                 return  # from PettingZoo's base class: the environment has no state
             if self._initialising or self._credit_from_state:
                 raise
-            # Only a critic reads the state: keep the previous one. Multiwalker has no state once an agent has fallen.
+            # Only QMIX's mixer reads the state here: keep the previous one. Multiwalker has no state once an agent has fallen.
             if not self._state_failed:
                 logging.getLogger(__name__).warning("%s; the previous state is used instead", error)
             self._state_failed = True

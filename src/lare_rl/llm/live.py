@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-from lare_rl.errors import LareError, install_command
+from lare_rl.errors import LareError, abbreviate, install_command
 from lare_rl.llm.budget import Budget, BudgetExceededError
 from lare_rl.llm.http_limits import (
     MAX_BODY_BYTES,
@@ -29,7 +29,7 @@ from lare_rl.llm.key import KEY_VARIABLE, api_key, redact_key
 from lare_rl.llm.prompts import Message
 from lare_rl.llm.request_forms import MIN_REPLY_TOKENS, FailedResponseError, RequestForms
 from lare_rl.util.safe_io import read_json
-from lare_rl.util.sanitize import abbreviate, one_line, replace_surrogates
+from lare_rl.util.sanitize import one_line, replace_surrogates
 from lare_rl.util.variables import read_variable
 
 __all__ = ["LiveModel", "ModelError"]

@@ -6,7 +6,7 @@ group reports the finding of its first rule that has one. The sentences are in `
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -88,7 +88,8 @@ def _outcome(run: RunSummary) -> Finding:
     if run.judged_return < run.random_mean - CLEAR_ERRORS * run.difference_error:
         return Finding("worse_than_random", values)
     if run.may_have_learned:
-        return Finding("may_beat_initial_policy" if run.beats_random() else "may_beat_random", values)
+        code = "may_beat_initial_policy" if run.beats_random() else "may_beat_random"
+        return Finding(code, values | {"n_errors": CLEAR_ERRORS})
     return Finding("not_learned", values)
 
 
@@ -108,7 +109,9 @@ def _episodic_comparison(run: RunSummary) -> Finding | None:
     code = "like_episodic" if abs(difference) <= bound else "above_episodic" if difference > 0 else "below_episodic"
     best = None if name is None else Finding("best_episodic", {"name": name})
     few_seeds = Finding("so_few_seeds") if min(run.n_seeds, n_seeds) < MIN_SEEDS else None
-    return Finding(code, {"episodic": Finding("episodic", {"return_": return_, "best": best}), "few_seeds": few_seeds})
+    sampled = Finding("of_sampled_actions") if run.judges_deterministic else None
+    episodic = Finding("episodic", {"return_": return_, "best": best})
+    return Finding(code, {"episodic": episodic, "sampled": sampled, "few_seeds": few_seeds})
 
 
 def _proxy_rewards(run: RunSummary) -> Finding | None:
@@ -213,13 +216,13 @@ def _needs_training(run: RunSummary) -> Finding | None:
     """Recommend more training for a policy that has not learned, and say if credit is not what limits it."""
     if not len(run.random_returns) or run.has_learned:
         return None
-    values: dict[str, Finding | None] = {"limit": None, "evaluate": None, "phi": None}
+    values: dict[str, Any] = {"limit": None, "evaluate": None, "phi": None, "directory": run.directory}
     if (run.return_r2 or 0) > HIGH_R2:
         agents, rule = Finding("among_agents"), Finding("own_rule")
         limit = {"agents": agents if run.many_agents else None, "rule": rule if run.is_own_task else None}
         values["limit"] = Finding("algorithm_is_limit", limit)
         if not run.sees_factors:
-            values["phi"] = Finding("products_need_phi", {"n_features": MAX_PAIRED_RAW_FEATURES})
+            values["phi"] = Finding("products_need_phi", {"n_features": MAX_PAIRED_RAW_FEATURES, "task": run.task})
     if run.may_have_learned and not run.beats_random():
         values["evaluate"] = Finding("evaluate_more", {"directory": run.directory})
     return Finding("needs_training", values)

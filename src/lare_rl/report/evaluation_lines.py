@@ -41,8 +41,8 @@ def evaluation_lines(
     start = time.monotonic()
     evaluation = evaluate_policy(run, episodes, best, deterministic, make_listener(episodes))
     policy_s = time.monotonic() - start
-    is_discrete = load_env_spec(task).discrete
-    samples = not (deterministic or ALGORITHMS[settings.algorithm].deterministic_evaluation(is_discrete))
+    env, algorithm = load_env_spec(task), ALGORITHMS[settings.algorithm]
+    samples = not (deterministic or algorithm.deterministic_evaluation(env.discrete, env.n_agents))
     likeliest = evaluate_policy(run, episodes, best, True, make_listener(episodes)) if samples else None
     best_steps = load_actor(run, best=True)[2].tolist() if best else None
     seeds, n_random = evaluation_seeds(run, episodes), max(episodes, RANDOM_EPISODES)

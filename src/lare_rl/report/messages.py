@@ -1,5 +1,7 @@
 """The sentences of a report, by the codes of its findings (`util/findings.py`). Commands are in backticks."""
 
+from lare_rl.credit.explanation_text import MESSAGES as EXPLANATIONS
+
 __all__ = ["MESSAGES", "WORDS"]
 
 MESSAGES = {
@@ -12,7 +14,7 @@ MESSAGES = {
     "headline_equal_returns": "Nothing can be learned",
     "equal_returns": (
         "All episodes, of the policy and of random actions, have the return {return_:number}. Next: does the environment give "
-        "rewards, and before its time limit (`max_episode_steps`)?"
+        "rewards, and before its time limit (`max_episode_steps`)? Do bad episodes differ (`docs/how-to/scores.md` of LaRe)?"
     ),
     # The outcome
     "headline_outcome_unknown": "Trained",
@@ -24,10 +26,10 @@ MESSAGES = {
     "headline_worse_than_random": "It got worse than random actions",
     "worse_than_random": "{reached}; {baseline}.",
     "headline_may_beat_random": "It may have learned",
-    "may_beat_random": "The difference from random actions is less than two standard errors. {reached}; {baseline}.",
+    "may_beat_random": "The difference from random actions is less than {n_errors} standard errors. {reached}; {baseline}.",
     "headline_may_beat_initial_policy": "It may have learned",
     "may_beat_initial_policy": (
-        "The difference from the policy before training is less than two standard errors. {reached}; {baseline}."
+        "The difference from the policy before training is less than {n_errors} standard errors. {reached}; {baseline}."
     ),
     "headline_not_learned": "It has not learned yet",
     "not_learned": "{reached}; {baseline}.",
@@ -42,19 +44,20 @@ MESSAGES = {
     "baseline": "random actions get {return_:number} ± {std:std} in {n_episodes:count episode}{initial}",
     "initial_policies": ", and before training it got {returns:number}",
     # The comparison with another run
-    "above_episodic": "That is more than training on the return of the episode alone gives here ({episodic}){few_seeds}.",
-    "like_episodic": "That is about as much as training on the return of the episode alone gives here ({episodic}){few_seeds}.",
-    "below_episodic": "That is less than training on the return of the episode alone gives here ({episodic}){few_seeds}.",
+    "above_episodic": "The return{sampled} is higher than that of training on the return of the episode alone ({episodic}){few_seeds}.",
+    "like_episodic": "The return{sampled} is about that of training on the return of the episode alone ({episodic}){few_seeds}.",
+    "below_episodic": "The return{sampled} is lower than that of training on the return of the episode alone ({episodic}){few_seeds}.",
+    "of_sampled_actions": " of sampled actions",
     "episodic": "{return_:number}{best}",
     "best_episodic": ", the best of these runs: {name}",
     "so_few_seeds": ", but so few seeds do not establish it",
     # The proxy rewards
     "explained": (
-        "Its proxy rewards, from {inputs}, explain {amount} of the score: R² of the last returns, before they were learned from, is "
-        "{r2:r2}."
+        "The proxy rewards, computed from {inputs}, explain {amount} of the score: R² of the last returns, predicted before the decoder "
+        "learned from them, is {r2:r2}."
     ),
     "decoder_is_outdated": (
-        "Its proxy rewards, from {inputs}, usually explain {amount} of the score (median R² of returns: {r2:r2}), but not the "
+        "The proxy rewards, computed from {inputs}, usually explain {amount} of the score (median R² of returns: {r2:r2}), but not the "
         "last episodes (R² {last_r2:r2}): the decoder may not have adapted to a new policy yet."
     ),
     "worse_than_mean": (
@@ -74,23 +77,20 @@ MESSAGES = {
     "form_log_odds": "won or lost, by the log odds that steps add",
     "form_history": "a sum over the steps, of functions of their entries and of the extremes so far",
     "form_progress": "the sum of the changes of its expected value",
-    "period": ", paid every {period} steps",
+    "period": ", paid every {period:count step}",
     "period_nonzero": ", paid with every reward that is not 0",
-    "paid_for": ", for the last {steps} steps",
+    "paid_for": ", for the last {steps:count step}",
     "with_groups": ", with an intercept for each group of episodes",
     "exact_last": "; the rest of the return is added to the reward of the last step",
     "exact_spread": "; the rest of the return is spread evenly over the steps",
     "trust_nothing": (
-        "It is not clear that the credit can be trusted: the squared error of predicted returns is {gain:.0%} ± {error:.0%} smaller "
-        "than with {baseline} as the prediction."
+        "It is not clear that the credit can be trusted: it does not predict returns clearly better than {baseline} does (gain "
+        "{gain:z.0%} ± {error:.0%})."
     ),
-    "trust_part": (
-        "Trust the credit in part: the squared error of predicted returns is {gain:.0%} ± {error:.0%} smaller than with {baseline} as "
-        "the prediction.{chance}"
-    ),
-    "trust_sums": (
-        "The sums of the credit over whole episodes can be trusted, which says nothing of single steps: the squared error of predicted "
-        "returns is {gain:.0%} ± {error:.0%} smaller than with {baseline} as the prediction."
+    "trust_part": "Trust the credit in part: {gain}{chance}",
+    "trust_sums": "The sums of the credit over whole episodes can be trusted, which says nothing of single steps: {gain}",
+    "gain": (
+        "the squared error of predicted returns is {gain:.0%} ± {error:.0%} smaller than with {baseline} as the prediction."
     ),
     "mean_return": "their mean",
     "mean_of_group": "the mean of their group",
@@ -112,7 +112,7 @@ MESSAGES = {
     "replace_phi": "another phi (`lare-rl design {task} --reflect 2 --model NAME`), or none (`--method bayes`)",
     "bad_raw_features": "the raw entries do not show what the score depends on",
     "write_phi": "a phi (`lare-rl prompt {task}`)",
-    "is_rising": "Next: it was still rising. To continue: {command}.",
+    "is_rising": "Next: the return was still rising. To continue: {command}.",
     "resume": "`lare-rl train --resume {directory}`",
     "resume_longer": "`lare-rl train --resume {directory} --steps {steps}`",
     "one_seed_was_better": (
@@ -120,12 +120,12 @@ MESSAGES = {
         "--best` plays the best policy of each seed. Then more `--steps`, or another `--algorithm`."
     ),
     "has_fallen": (
-        "Next: it was better before, {return_:number} at step {step:,}. `lare-rl evaluate {directory} --best` plays the best policy "
-        "of each seed."
+        "Next: the return was higher before, {return_:number} at step {step:,}. `lare-rl evaluate {directory} --best` plays the best "
+        "policy of each seed."
     ),
     "is_stuck": (
-        "Next: {cause}. More `--steps` alone will not help. Bring observations to about -1 to 1, or try another `--algorithm` "
-        "(`lare-rl algorithms`), or more random steps at first."
+        "Next: {cause}. More `--steps` seldom help: see `docs/how-to/poor-policies.md` of LaRe, or try another `--algorithm` (`lare-rl "
+        "algorithms`)."
     ),
     "saturated": "the policy chooses the same action in every state{seeds}, with each entry at a bound",
     "saturated_seeds": " with {n_saturated} of {n_seeds} seeds",
@@ -133,7 +133,8 @@ MESSAGES = {
         "it repeats one behaviour: the last {n_evaluations} returns of a seed hardly differ, but the returns of random actions do"
     ),
     "needs_training": (
-        "{limit}Next: {evaluate}more `--steps` (`lare-rl train --resume`), or another `--algorithm` (`lare-rl algorithms`).{phi}"
+        "{limit}Next: {evaluate}more `--steps` (`lare-rl train --resume {directory}`), or another `--algorithm` (`lare-rl "
+        "algorithms`).{phi}"
     ),
     "algorithm_is_limit": (
         "The proxy rewards predict returns well, so the algorithm, or the number of steps, may be the limit{agents}{rule}. "
@@ -143,7 +144,7 @@ MESSAGES = {
     "evaluate_more": "run `lare-rl evaluate {directory} --episodes 50`. If it is still unclear, try ",
     "products_need_phi": (
         " If state and action have more than {n_features} entries together, a score that depends on products of them, such as price "
-        "times power, needs a phi (`lare-rl prompt`)."
+        "times power, needs a phi (`lare-rl prompt {task}`)."
     ),
     "needs_baseline": (
         "Next: better than random actions may be far from good. Compare it with a rule of your own "
@@ -159,7 +160,8 @@ MESSAGES = {
 WORDS = {
     "return": (
         "return",
-        "The sum of the true rewards of an episode. An evaluation plays some episodes, and takes their mean.",
+        "The sum of the true rewards of an episode; of a team, the sum over the steps of the mean over its living agents. An evaluation "
+        "plays some episodes, and takes their mean.",
     ),
     "random": (
         "random actions",
@@ -180,8 +182,8 @@ WORDS = {
     "factor": ("factor", "A number of a step that phi computes. The decoder turns the factors into the proxy reward."),
     "share": (
         "share",
-        "How much of the variation of the returns a factor explains. Shares add up to the R² of all factors. 0% does not "
-        "say that it is useless: perhaps its mean hardly differed between episodes. A factor that offsets others has a negative share.",
+        "How much of the variation of the returns a factor explains. Shares add up to the R² of all factors. "
+        + EXPLANATIONS["about_shares"],
     ),
     "effect": (
         "effect",

@@ -32,10 +32,10 @@ __all__ = [
 MAX_HOVER_LINES = 10
 """The largest number of lines of a text that appears at a step: the step, and a value of each run."""
 _METRICS = {
-    RETURN: "return",
-    RETURN_R2: "R² of returns",
-    CREDIT_CORRELATION: "correlation",
-    CREDIT_ERROR: "credit error",
+    RETURN: WORDS["return"][0],
+    RETURN_R2: WORDS["r2"][0],
+    CREDIT_CORRELATION: WORDS["correlation"][0],
+    CREDIT_ERROR: WORDS["error"][0],
 }
 """The metrics in tables of final values, with their titles."""
 

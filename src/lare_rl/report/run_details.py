@@ -144,10 +144,7 @@ def _render_earnings(run: Run, credit: EpisodeCredit | None) -> Iterable[str]:
     if any(explanations):
         yield _render_heading("What earned the score", "share")
         source = explanation_source(run)
-        text = (
-            "A bar is the share of the differences between returns that a factor explains. A bar to the left is a negative share: the "
-            "factor offsets others."
-        )
+        text = "A bar is the share of the differences between returns that a factor explains. A bar to the left is a negative share."
         yield render_note(f"{text} {source}." if source else text)
     for team_index, role in enumerate(roles):
         findings, labels = explanations[team_index] if explanations else [], label_factors(run, team_index)

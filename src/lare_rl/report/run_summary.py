@@ -201,11 +201,12 @@ class RunSummary:
 
     @property
     def n_seeds_learned(self) -> int:
-        """The number of seeds that end above random actions, and clearly above their own return before training."""
-        threshold: Any = self.random_mean + SEED_STDS * self.random_std
+        """The number of seeds that end clearly above random actions, and above their own return before training."""
+        seed_error = math.sqrt(self.n_seeds) * self.episode_error
+        error = math.hypot(standard_error(self.random_returns), seed_error)
+        threshold: Any = self.random_mean + max(SEED_STDS * self.random_std, CLEAR_ERRORS * error)
         if self.initial_returns is not None:
-            seed_error = math.sqrt(2 * self.n_seeds) * self.episode_error
-            threshold = np.maximum(threshold, self.initial_returns + CLEAR_ERRORS * seed_error)
+            threshold = np.maximum(threshold, self.initial_returns + CLEAR_ERRORS * math.sqrt(2) * seed_error)
         return int(np.sum(self.judged_returns > threshold))
 
     @cached_property

@@ -49,8 +49,10 @@ class ScoreUse:
         baseline = Finding("mean_of_payments" if self.period else "mean_of_group" if self.has_groups else "mean_return")
         code = "trust_nothing" if not self.is_clear else "trust_sums" if self.gain > CLEAR_GAIN else "trust_part"
         chance = Finding("chance_remains") if self.is_binary and code == "trust_part" else None
-        values = {"gain": self.gain, "error": self.gain_error, "baseline": baseline, "chance": chance}
-        trust = Finding(code, values)
+        values = {"gain": self.gain, "error": self.gain_error, "baseline": baseline}
+        trust = Finding(
+            code, values if code == "trust_nothing" else {"gain": Finding("gain", values), "chance": chance}
+        )
         is_plain = self.period is None and self.window is None and not self.has_groups and self.exact == "no"
         if self.equal_lengths and self.form in ("form_sum", "form_mean") and is_plain:
             return trust

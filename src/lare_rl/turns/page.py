@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lare_rl.errors import abbreviate
 from lare_rl.report.figures import COLOURS, make_figure, to_svg
 from lare_rl.report.html import render_note, render_table, write_page
 from lare_rl.turns.credit import EFFECT_KINDS, CreditedTurns
@@ -16,7 +17,7 @@ from lare_rl.turns.rollouts import Rollout
 from lare_rl.turns.words import MESSAGES, count_decimals
 from lare_rl.util.findings import format_for_reader, render
 from lare_rl.util.provenance import code_version
-from lare_rl.util.sanitize import abbreviate, one_line
+from lare_rl.util.sanitize import one_line
 
 __all__ = ["choose_rollouts", "write_turn_report"]
 

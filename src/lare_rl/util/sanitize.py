@@ -5,7 +5,6 @@ import unicodedata
 
 __all__ = [
     "NAME_RULE",
-    "abbreviate",
     "first_invisible",
     "is_name",
     "last_line",
@@ -15,7 +14,7 @@ __all__ = [
 ]
 
 MAX_NAME_LENGTH = 80
-NAME_RULE = f"a text of 1 to {MAX_NAME_LENGTH} visible characters, without line breaks, and spaces only between words"
+NAME_RULE = f"a text of 1 to {MAX_NAME_LENGTH} visible characters, without line breaks, and with single spaces between words only"
 """The rule of `is_name`, for messages."""
 
 # Invisible letters and marks (Default_Ignorable_Code_Point), and the empty Braille pattern.
@@ -26,18 +25,13 @@ _FILLERS = re.compile(
 _INVISIBLE_CATEGORIES = frozenset({"Cc", "Cf", "Co", "Cs", "Cn", "Zl", "Zp"})
 
 
-def abbreviate(text: str, length: int) -> str:
-    """Return a text, or its first characters and dots if it is longer than `length`."""
-    return text if len(text) <= length else f"{text[:length]}..."
-
-
 def last_line(text: str) -> str:
-    """Return the last line of a text, without white space at its end."""
+    """Return the last line of a text that is not blank, without white space at its end."""
     return text.strip().rpartition("\n")[2]
 
 
 def sanitize(text: str) -> str:
-    """Replace control and invisible characters by `?`."""
+    """Replace control and invisible characters by `?`, except line breaks and tabs."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(letter if _is_visible(letter) else "?" for letter in text)
@@ -59,7 +53,7 @@ def replace_surrogates(text: str) -> str:
 
 
 def first_invisible(text: str) -> int | None:
-    """Return the index of the first invisible character, or None."""
+    """Return the index of the first control or invisible character, except line breaks and tabs, or None."""
     if text.isascii() and text.replace("\n", "").replace("\t", "").isprintable():
         return None
     return next((index for index, letter in enumerate(text) if not _is_visible(letter)), None)
