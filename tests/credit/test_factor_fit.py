@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.factor_fit import N_FIRST, assess_factors, explain_returns, predict_returns
+from lare_rl.credit.factor_fit import N_FIRST, assess_factors, explain_returns, predict_by_factors
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.util.statistics import r_squared
 
@@ -42,7 +42,7 @@ def test_returns_are_predicted_before_a_fit_sees_them():
     factors = [episode[..., :2] for episode in inputs]
     changed = np.where(np.arange(60) < 40, returns, -returns)
     before, after = (
-        np.asarray(predict_returns(factors, alive, r)[0].predicted[: 60 - N_FIRST, ScoreType.SUM])
+        np.asarray(predict_by_factors(factors, alive, r)[0].predicted[: 60 - N_FIRST, ScoreType.SUM])
         for r in (returns, changed)
     )
     n_equal = int(np.argmax(before != after))

@@ -9,6 +9,7 @@ import pytest
 from helpers.scripted_model import ScriptedModel, to_reply
 from helpers.toy_envs import toy_spec
 from lare_rl.envs.play import Episode, play_episodes
+from lare_rl.errors import LareError
 from lare_rl.latent.design import design
 from lare_rl.latent.function import verify_function
 from lare_rl.llm import prompts
@@ -69,9 +70,15 @@ def test_groups_have_intercepts(episodes):
         for episode, shift_t in zip(episodes, shift, strict=True)
     ]
     assessment = assess(RIGHT, grouped)
-    assert assessment.r2 > 0.98
-    assert 0.5 < assessment.level_r2 < assessment.r2
-    assert assess(RIGHT, episodes).level_r2 is None
+    assert assessment.fit.r2 > 0.98
+    assert 0.5 < assessment.fit.level_r2 < assessment.fit.r2
+    assert assess(RIGHT, episodes).fit.level_r2 is None
+
+
+def test_number_of_groups_is_limited(episodes):
+    grouped = [replace(episode, group=str(number)) for number, episode in enumerate(2 * episodes)]
+    with pytest.raises(LareError, match="more than 64 groups"):
+        assess(RIGHT, grouped)
 
 
 def test_agents_that_left_do_not_count():
@@ -87,7 +94,7 @@ def test_agents_that_left_do_not_count():
         observation[~alive] = 1e6
         return Episode(observation, action, observation, alive, reward, team_reward)
 
-    assert assess(RIGHT, [make_episode(length) for length in rng.integers(10, 30, size=40)]).r2 > 0.99
+    assert assess(RIGHT, [make_episode(length) for length in rng.integers(10, 30, size=40)]).fit.r2 > 0.99
 
 
 def test_no_model_is_asked_without_a_reason(episodes):

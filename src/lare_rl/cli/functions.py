@@ -200,6 +200,7 @@ def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: Se
     from lare_rl.training.reflect import assess_function
 
     assessment = assess_function(function, role, episodes)
+    fit = assessment.fit
     n_steps = sum(len(episode.team_reward) for episode in episodes) / len(episodes)
     n_paid = sum(int((episode.team_reward != 0).sum()) for episode in episodes) / len(episodes)
     if n_paid > 1:
@@ -215,23 +216,23 @@ def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: Se
                 "episodes too: a score that is 0 for all random actions teaches nothing."
             )
         return
-    if math.isfinite(assessment.r2):
-        r2, r2_error = format_for_reader(assessment.r2, "r2"), format_for_reader(assessment.r2_error, "error")
+    if math.isfinite(fit.r2):
+        r2, r2_error = format_for_reader(fit.r2, "r2"), format_for_reader(fit.r2_error, "error")
         print_line(
             f"Returns of unseen episodes, predicted by the factors: R² = {r2} (1: exactly; 0: no better than their mean), "
             f"with a standard error of {r2_error}."
         )
-        if assessment.r2 < GOOD_R2:
+        if fit.r2 < GOOD_R2:
             print_line(
-                _better_observation(function, role, episodes, assessment.r2)
+                _better_observation(function, role, episodes, fit.r2)
                 or f"Play more episodes: if the factors are right, R² rises. If it remains below about {GOOD_R2}, phi lacks something "
                 "that the score depends on, or the score is partly noise or decided by the initial state."
             )
-        if assessment.length_r2 is not None:
-            length_r2 = format_for_reader(assessment.length_r2, "r2")
+        if fit.length_r2 is not None:
+            length_r2 = format_for_reader(fit.length_r2, "r2")
             print_line(f"Predicted by the lengths of these episodes alone, without a factor: R² = {length_r2}.")
-        if assessment.level_r2 is not None:
-            level_r2 = format_for_reader(assessment.level_r2, "r2")
+        if fit.level_r2 is not None:
+            level_r2 = format_for_reader(fit.level_r2, "r2")
             print_line(
                 f"Each group has an intercept in this fit. Predicted by the groups alone, without a factor: R² = {level_r2}."
             )
@@ -252,7 +253,7 @@ def _better_observation(
     for name in get_args(ScoredObservation):
         if name != role.scored_observation:
             other_role = role.model_copy(update={"scored_observation": name})
-            other = assess_function(function, other_role, episodes)
+            other = assess_function(function, other_role, episodes).fit
             if other.r2 - other.r2_error > r2:
                 better[name] = other.r2
     if not better:

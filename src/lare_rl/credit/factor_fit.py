@@ -1,10 +1,12 @@
-"""How well factors predict returns that a fit has not seen, and the explanation of all returns by the factors.
+"""How well factors predict returns that a fit has not seen, and the explanation of all returns by factors and raw features.
 
-R_hat_k of `prequential.py` is here predicted by a closed-form fit, on the factors alone, to episodes before k (the prequential
-principle: Dawid, Journal of the Royal Statistical Society A 147, 1984). The fit is repeated whenever the number of episodes has grown
-by a twentieth. The factors are standardised over all episodes. R^2 thus compares functions with different numbers of factors.
+Here R_hat_k of `prequential.py` is the prediction of R_k by a closed-form fit, on the factors alone, to episodes before k (the prequential
+principle: Dawid, Journal of the Royal Statistical Society A 147, 1984). The fit is repeated as in training (`closed_form.is_due`). The
+factors are standardised over the steps of all episodes. No return is predicted after it was fitted, so R^2 can compare functions with
+different numbers of factors.
 
-If episodes belong to levels, each level has an intercept beside the factors, as in training (`closed_form.py`).
+If episodes belong to levels, each level has an intercept beside the factors, as in training (`closed_form.py`). The explanation has no
+intercepts of levels.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -21,7 +23,7 @@ from lare_rl.credit.basis import Basis
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.methods import METHODS
+from lare_rl.credit.methods import FACTORS_ALONE
 from lare_rl.credit.prequential import Predictions, empty_predictions
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate, compare_score_types, is_better
 from lare_rl.credit.spec import CreditSpec
@@ -29,7 +31,7 @@ from lare_rl.nn.normalise import RunningMeanStd
 from lare_rl.util.float64 import float64
 from lare_rl.util.statistics import r_squared
 
-__all__ = ["FactorAssessment", "assess_factors", "explain_returns", "predict_returns"]
+__all__ = ["N_FIRST", "FactorAssessment", "assess_factors", "explain_returns", "predict_by_factors"]
 
 N_FIRST = 10
 """The number of episodes before the first prediction."""
@@ -39,7 +41,7 @@ class FactorAssessment(NamedTuple):
     """What one team's returns say about factors."""
 
     r2: float
-    """NaN if all returns are equal, or if there are too few."""
+    """NaN if all returns after the first `N_FIRST` are equal, or if there are fewer than two of them."""
     r2_error: float
     """The standard error of `r2` over the episodes."""
     length_r2: float | None
@@ -66,23 +68,24 @@ def assess_factors(
         alive: for each episode, which agents acted at each step.
         returns: R of each episode.
         basis: the features that are computed from the inputs.
-        score: `sum` or `average`, if the type of the score is known, or `binary`, which says nothing about these two.
-        level: the level of each episode, from 0 on, if there are levels.
+        score: `sum` or `average`. None or `binary`: the returns decide between these two.
+        level: the level of each episode, from 0 to `MAX_LEVELS` - 1, if there are levels.
     """
     factors = [rows[..., : basis.n_factors] for rows in inputs]
     no_factors, no_level = [np.zeros_like(rows) for rows in factors], np.zeros(len(returns), int)
     fixed_length = len(set(map(len, inputs))) == 1
-    predictions, start_value = predict_returns(factors, alive, returns, level)
+    predictions, start_value = predict_by_factors(factors, alive, returns, level)
     index, estimate = int(score == "average" and not fixed_length), None
     if score not in ("sum", "average") and not fixed_length:
         index = int(is_better(predictions, ScoreType.AVERAGE, ScoreType.SUM))
         estimate = compare_score_types(predictions, (ScoreType.SUM, ScoreType.AVERAGE), index)
     length_r2 = level_r2 = None
     if index == ScoreType.SUM and not fixed_length:
-        lengths_alone, _ = predict_returns(no_factors, alive, returns, None if level is None else no_level)
+        # One level, not None: the functions that were compiled with levels are used again.
+        lengths_alone, _ = predict_by_factors(no_factors, alive, returns, None if level is None else no_level)
         length_r2, _ = _r2(lengths_alone, returns, ScoreType.SUM)
     if level is not None:
-        levels_alone, _ = predict_returns(no_factors, alive, returns, level)
+        levels_alone, _ = predict_by_factors(no_factors, alive, returns, level)
         level_r2, _ = _r2(levels_alone, returns, -1)  # an average, because a sum would know the lengths
     r2, r2_error = _r2(predictions, returns, index)
     start_value = start_value if index == ScoreType.SUM else 0.0
@@ -102,7 +105,7 @@ def _r2(predictions: Predictions, returns: Float[np.ndarray, " episodes"], index
     return r_squared(later, np.asarray(predictions.predicted, np.float64)[: len(later), index])
 
 
-def predict_returns(
+def predict_by_factors(
     factors: Sequence[Float[np.ndarray, "_ agents factors"]],
     alive: Sequence[Bool[np.ndarray, "_ agents"]],
     returns: Float[np.ndarray, " episodes"],
@@ -116,7 +119,7 @@ def predict_returns(
     """
     count, (_, agents, n_factors) = len(returns), factors[0].shape
     spec = CreditSpec(
-        method=replace(METHODS["lare-linear"], decoder="additive"),
+        method=FACTORS_ALONE,
         settings=CreditSettings(),
         n_factors=n_factors,
         observation_size=0,

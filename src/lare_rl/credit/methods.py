@@ -7,7 +7,7 @@ several, unless its row says otherwise.
 `register_method` adds a method, for this package and for plugins alike.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from types import NoneType
 from typing import Literal
@@ -18,7 +18,7 @@ from lare_rl.credit.input_names import InputNames
 from lare_rl.errors import LareError, short_repr
 from lare_rl.util.plugins import Registry
 
-__all__ = ["METHODS", "Fit", "Method", "Reward", "register_method"]
+__all__ = ["FACTORS_ALONE", "METHODS", "Fit", "Method", "Reward", "register_method"]
 
 
 class Fit(StrEnum):
@@ -287,3 +287,6 @@ for _method in (
            FACTORS, Fit.ALL_STEPS, shared=True),
 ):
     register_method(_method)
+
+FACTORS_ALONE = replace(METHODS["lare-linear"], decoder="additive")
+"""How factors explain returns, with their shapes and pairs, and without raw features. It is not registered."""

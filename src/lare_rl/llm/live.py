@@ -200,7 +200,7 @@ class LiveModel:
         """Describe the error of a request, and count the most that the request may have cost."""
         name = type(error).__name__
         if isinstance(error, StatusError):
-            return self._http_error(error)
+            return self._http_error(error, max_tokens)
         if isinstance(error, RedirectError):
             return _Failure(_safe_text(error), retry=False)
         if isinstance(error, ValueError):  # half of a surrogate pair in a message, or a temperature that is not finite
@@ -217,10 +217,10 @@ class LiveModel:
         self.budget.count_reply(None, messages, max_tokens)  # the server may have answered
         return _Failure(_safe_text(f"{name}: {error}"), retry=True, timed_out="Timeout" in name)
 
-    def _http_error(self, error: StatusError) -> _Failure:
+    def _http_error(self, error: StatusError, max_tokens: int) -> _Failure:
         """Handle an HTTP error: change the request, wait, or give up."""
         message = _safe_text(f"HTTP {error.status}: {_error_text(error.body)}")
-        forms = self.forms.after_http_error(error.status, error.body.lower(), self.temperature is not None)
+        forms = self.forms.after_http_error(error.status, error.body, max_tokens, self.temperature is not None)
         if forms is not None:
             self.forms = forms
             return _Failure(message, retry=True, request_changed=True)

@@ -3,7 +3,7 @@
     responses   OpenAI's Responses API, with a JSON schema
     chat        chat completions: with a JSON schema, with a JSON object, or with the structure only in words
 
-A model keeps the form that its server has answered.
+A `LiveModel` keeps the form that its server has answered.
 """
 
 import re
@@ -68,12 +68,12 @@ class Answer(NamedTuple):
 
 @dataclass(frozen=True)
 class RequestForms:
-    """The requests that a server may support, the present one first."""
+    """How a server is asked: the forms that it may support, the present one first, and the options that it accepts."""
 
     forms: tuple[_RequestForm, ...] = _REQUEST_FORMS
     chat_limits: tuple[str, ...] = _CHAT_LIMITS
     reply_tokens: int = MAX_REPLY_TOKENS
-    has_temperature: bool = True
+    takes_temperature: bool = True
     is_verified: bool = False
     """Whether the server has answered a request in the first of these forms."""
 
@@ -83,7 +83,7 @@ class RequestForms:
 
     @property
     def may_lack_responses(self) -> bool:
-        """Whether the server is asked for responses, and has not answered such a request yet."""
+        """Whether the server is asked through the Responses API, and has not answered such a request yet."""
         return self.api == "responses" and not self.is_verified
 
     def request(
@@ -91,7 +91,7 @@ class RequestForms:
     ) -> dict[str, Any]:
         """Return the arguments of a request."""
         options = {"model": name, **self.forms[0].options}
-        if temperature is not None and self.has_temperature:
+        if temperature is not None and self.takes_temperature:
             options["temperature"] = temperature
         if self.api == "responses":
             # OpenAI stores responses by default, and no chat completions.
@@ -102,29 +102,33 @@ class RequestForms:
         """Return the forms of chat completions."""
         return replace(self, forms=tuple(form for form in self.forms if form.api == "chat"), is_verified=False)
 
-    def after_http_error(self, status: int, reason: str, has_temperature: bool) -> "RequestForms | None":
+    def after_http_error(self, status: int, body: str, max_tokens: int, has_temperature: bool) -> "RequestForms | None":
         """Return the forms after a refused request, or None if nothing is left to change.
 
         Args:
             status: the HTTP status.
-            reason: the body of the answer, in lower case.
-            has_temperature: whether the request had a temperature.
+            body: the body of the answer.
+            max_tokens: the limit of the request.
+            has_temperature: whether the user has set a temperature.
         """
         if status in _REFUSED_STATUSES:
-            return self._ask_for_less(reason, has_temperature)
+            return self._ask_for_less(_without_echo(body).lower(), max_tokens, has_temperature)
         is_missing = self.may_lack_responses and status in _MISSING_API_STATUSES
         return self.without_responses() if is_missing else None
 
-    def _ask_for_less(self, reason: str, has_temperature: bool) -> "RequestForms | None":
-        """Return the forms without what a refusal names: so many tokens, an option, or a structure. None if nothing is left."""
+    def _ask_for_less(self, reason: str, max_tokens: int, has_temperature: bool) -> "RequestForms | None":
+        """Ask for fewer tokens or without an option, if the refusal names it.
+
+        If not, ask in the next form, unless this form has been answered before. None if nothing is left to change.
+        """
         is_too_long = "token" in reason and re.search("large|at most|maximum|context|exceed", reason)
         if is_too_long and self.reply_tokens > MIN_REPLY_TOKENS:
-            return replace(self, reply_tokens=self.reply_tokens // 2)
+            return replace(self, reply_tokens=max(MIN_REPLY_TOKENS, min(self.reply_tokens, max_tokens) // 2))
         older_limit = replace(self, chat_limits=self.chat_limits[1:]) if len(self.chat_limits) > 1 else None
         if older_limit and self.api == "chat" and "max_completion_tokens" in reason:
             return older_limit
-        if "temperature" in reason and has_temperature and self.has_temperature:
-            return replace(self, has_temperature=False)
+        if "temperature" in reason and has_temperature and self.takes_temperature:
+            return replace(self, takes_temperature=False)
         if self.is_verified:  # the server has answered this form before, so it refuses the text
             return None
         if len(self.forms) > 1:
@@ -140,6 +144,20 @@ class RequestForms:
         """
         answer = read_json(body)
         return _read_response(answer) if self.api == "responses" else _read_completion(answer)
+
+
+def _without_echo(body: str) -> str:
+    """Return the body of a refusal without the request, which some servers repeat in it under the key `input`."""
+
+    def remove(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: remove(item) for key, item in value.items() if key != "input"}
+        return [remove(item) for item in value] if isinstance(value, list) else value
+
+    try:
+        return str(remove(read_json(body)))
+    except ValueError:
+        return body
 
 
 def _read_completion(answer: Any) -> Answer:

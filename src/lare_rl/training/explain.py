@@ -12,7 +12,7 @@ from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.decoder_state import CreditBatch, start_value, valid_rows
 from lare_rl.credit.explanation import Explanation, add_to_explanation, explain, init_explanation
 from lare_rl.credit.explanation_text import LEGEND_CODES, MESSAGES, MIN_EXPLAINED_EPISODES, returns_findings
-from lare_rl.credit.methods import METHODS, Method
+from lare_rl.credit.methods import FACTORS_ALONE, METHODS, Method
 from lare_rl.data.replay import Index, Replay, segments_as_episodes
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, update_mean_std
 from lare_rl.runs.directory import Run
@@ -124,7 +124,7 @@ def _explanation_config(config: TrainConfig) -> TrainConfig:
     if has_raw_features:
         method = _explaining_method(config.method)
     elif config.method.needs_phi:
-        method = replace(METHODS["lare-linear"], decoder="additive")
+        method = FACTORS_ALONE
     else:
         method = replace(METHODS["bayes"], inputs=config.method.inputs)
     return replace(config, method=method)

@@ -1,4 +1,5 @@
-"""Algorithms that consume transitions: sample, fit the decoder, relabel by it, update; many times in one compiled call.
+"""Algorithms that consume transitions: sample, fit the decoder if it is fitted here, relabel by it, update; many times in one
+compiled call.
 
 Algorithm 1 of the LaRe paper, lines 6 to 8, for TD3, DDPG and SAC. They train a single agent.
 """
@@ -20,6 +21,7 @@ from lare_rl.training.decoder_fits import fit_decoders, sample_credit
 from lare_rl.training.episodes import Decoders
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import rewards
+from lare_rl.util.rounding import round_up
 
 __all__ = ["train_step"]
 
@@ -27,8 +29,13 @@ __all__ = ["train_step"]
 def train_step(
     learner: Learner, steps: Trajectory, key: PRNGKeyArray, env_steps: Int[Scalar, ""], config: TrainConfig
 ) -> tuple[Learner, Metrics]:
-    """Update decoder and algorithm once for each new step of an environment. `steps` are not read, because they are stored."""
-    sample_key, _, noise_key = jax.random.split(key, 3)
+    """Update the algorithm once for each new step of all environments, and with it a decoder of `config.joint_fit`.
+
+    `steps` are not read, because they are stored.
+    """
+    sample_key, _, update_key = jax.random.split(
+        key, 3
+    )  # the second key is unused: without it, all random numbers would change
     algorithm, settings, buffer = config.algorithm.load(), config.hyperparameters, learner.replay
     assert isinstance(settings, OffPolicySettings)
 
@@ -39,18 +46,18 @@ def train_step(
         metrics = {}
         if credit_sample is not None:
             decoders, metrics = fit_decoders(decoders, buffer, credit_sample, fit_key, config)
-        steps = replay.read(buffer, index)
-        batch = _transitions(steps, rewards(steps, decoders, config))
+        stored = replay.read(buffer, index)
+        batch = _transitions(stored, rewards(stored, decoders, config))
         state, algorithm_metrics = algorithm.update(state, batch, key, update_index, settings)
         return (state, decoders), metrics | algorithm_metrics
 
     # The steps of all updates are sampled at once. Their rows are read when the update runs.
     batch_key, credit_key = jax.random.split(sample_key)
     inputs = (
-        env_steps - settings.warmup + jnp.arange(config.iteration_steps),
+        env_steps - round_up(settings.warmup, config.iteration_steps) + jnp.arange(config.iteration_steps),
         sample_transitions(buffer, batch_key, (config.iteration_steps, settings.batch_size)),
         sample_credit(buffer, credit_key, config.iteration_steps, config) if config.joint_fit else None,
-        jax.random.split(noise_key, config.iteration_steps),
+        jax.random.split(update_key, config.iteration_steps),
     )
     (state, decoders), metrics = jax.lax.scan(update, (learner.algorithm, learner.decoders), inputs)
     return learner._replace(algorithm=state, decoders=decoders), jax.tree.map(jnp.mean, metrics)

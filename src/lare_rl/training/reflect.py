@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.explanation_text import MESSAGES, MIN_EXPLAINED_EPISODES, explanation_findings
-from lare_rl.credit.factor_fit import assess_factors
+from lare_rl.credit.factor_fit import N_FIRST, FactorAssessment, assess_factors
 from lare_rl.credit.input_names import raw_feature_names
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.play import Episode, Policy, play_episodes
@@ -26,7 +26,7 @@ from lare_rl.llm.recorder import Recorder
 from lare_rl.llm.recording import Exchange
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.runs.directory import Run, as_run
-from lare_rl.tasks.spec import TaskSpec, require_role, select_sides
+from lare_rl.tasks.spec import MAX_LEVELS, TaskSpec, require_role, select_sides
 from lare_rl.training.stored_episodes import stored_role_episodes
 from lare_rl.util.findings import render
 
@@ -78,14 +78,16 @@ def reflect(
         elif isinstance(episodes, Run | str | Path):
             episodes = stored_role_episodes(as_run(episodes), role)
         best, assessment = function, assess_function(function, role, episodes)
-        if math.isnan(assessment.r2):
+        if math.isnan(assessment.fit.r2):
             raise LareError(
-                "the returns of all episodes are equal, and no function can predict them better than another"
+                f"the returns of all episodes after the first {N_FIRST} are equal, and no function can predict them better than another"
             )
     except (LareError, KeyboardInterrupt) as error:
         on_message(f"no reflection: {str(error) or 'stopped'}")
         return function
-    on_message(f"reflection: the factors of the first function predict unseen returns with R² = {assessment.r2:.3f}")
+    on_message(
+        f"reflection: the factors of the first function predict unseen returns with R² = {assessment.fit.r2:.3f}"
+    )
     for number in range(1, rounds + 1):
         try:
             evidence = "\n".join([*assessment.ranges, *assessment.sentences])
@@ -99,8 +101,10 @@ def reflect(
         except KeyboardInterrupt:
             on_message(f"reflection {number}: stopped")
             break
-        is_better = candidate_assessment.r2 > assessment.r2
-        on_message(f"reflection {number}: R² = {candidate_assessment.r2:.3f}, {'kept' if is_better else 'not better'}")
+        is_better = candidate_assessment.fit.r2 > assessment.fit.r2
+        on_message(
+            f"reflection {number}: R² = {candidate_assessment.fit.r2:.3f}, {'kept' if is_better else 'not better'}"
+        )
         if is_better:
             best, assessment = candidate, candidate_assessment
     return conversation.add_exchanges(best)
@@ -121,14 +125,7 @@ def _find_reply(function: LatentFunction) -> str:
 class FunctionAssessment(NamedTuple):
     """What the returns of some episodes say about a function."""
 
-    r2: float
-    """R^2 of the returns, each predicted by the factors before it was seen; NaN if the returns are all the same."""
-    r2_error: float
-    """Its standard error over the episodes."""
-    length_r2: float | None
-    """R^2 of predictions by the lengths of the episodes alone; None if all lengths are equal."""
-    level_r2: float | None
-    """R^2 of predictions by the groups of the episodes alone; None without groups."""
+    fit: FactorAssessment
     sentences: list[str]
     """Sentences for the user; empty if the returns are all the same."""
     ranges: list[str]
@@ -139,7 +136,7 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
     """Assess a function by the returns of some episodes.
 
     Raises:
-        LareError: there are too few episodes, or the function failed on one of them.
+        LareError: there are too few episodes or too many groups, or the function failed on an episode.
     """
     if len(episodes) < MIN_EXPLAINED_EPISODES:
         raise LareError(f"{len(episodes)} episodes say too little of a function: {MIN_EXPLAINED_EPISODES} are needed")
@@ -158,10 +155,7 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
     valid_factors = np.concatenate([rows[mask] for rows, mask in zip(inputs, alive, strict=True)])[:, : len(names)]
     findings = explanation_findings(fit.explanation, fit.score_type, names, raw_names)
     return FunctionAssessment(
-        r2=fit.r2,
-        r2_error=fit.r2_error,
-        length_r2=fit.length_r2,
-        level_r2=fit.level_r2,
+        fit=fit,
         sentences=[render(finding, MESSAGES) for finding in findings],
         ranges=_describe_ranges(names, valid_factors),
     )
@@ -173,6 +167,8 @@ def _levels(episodes: Sequence[Episode]) -> Int[np.ndarray, " episodes"] | None:
     numbers = {group: i for i, group in enumerate(dict.fromkeys(groups))}
     if None in numbers or len(numbers) < 2:
         return None
+    if len(numbers) > MAX_LEVELS:
+        raise LareError(f"the episodes have more than {MAX_LEVELS} groups: merge some of them")
     return np.array([numbers[group] for group in groups])
 
 
