@@ -38,7 +38,7 @@ def main(lanes: int = 4, processes: int = 2, burn_ms: float = 20, steps: int = 2
     tables = {}
     for title, seconds, many in ((f"{burn_ms:g} ms a step", burn_ms / 1000, steps), ("0 ms a step", 0.0, 40 * steps)):
         makers = [partial(Burns, seconds)] * lanes
-        with LocalVecEnv(makers) as near, SubprocVecEnv(makers, processes) as far:
+        with LocalVecEnv(makers) as near, SubprocVecEnv(makers, processes, timeout=60.0) as far:
             contenders = {REFERENCE: near, f"{processes} workers": far}
             turn_seconds = interleave({name: partial(turn, envs, many) for name, envs in contenders.items()}, rounds)
         tables[title] = summary(turn_seconds, many, REFERENCE)

@@ -175,6 +175,7 @@ def check(method, agents=1, observation_size=9, credit=SUM_CREDIT, **changes):
         ("rd-linear", {"observation_size": 1024}, ["1024", "1025"]),
         ("rrd", {"credit": CreditSettings(steps=16)}, ["sampled_steps"]),
         ("diaster", {"credit": CreditSettings(hidden=())}, ["hidden"]),
+        ("rrdu", {"observation_size": 7056, "credit": CreditSettings(score="average")}, ["average", "1024"]),
     ],
 )
 def test_check_training_refuses(method, changes, texts):

@@ -89,6 +89,32 @@ def test_prefixes_are_summed_like_separate_cases():
     np.testing.assert_allclose(statistics.products, np.cov(cases.T, bias=True) * 7, rtol=1e-4, atol=1e-5)
 
 
+def test_an_average_step_of_an_average_earns_nothing():
+    """The return depends on the level alone, and the levels have unlike numbers of episodes."""
+    rng, lengths = np.random.default_rng(0), np.tile([1, 3], 50)
+    spec = observation_spec(2, METHOD, CreditSettings(score="average"), 3, fixed_length=False, has_groups=True)
+    level = np.int32(rng.permutation(100) < 10)
+    returns = np.where(level == 0, 100.0, -100.0)
+    rows = rng.normal(size=(lengths.sum(), 1, 2)).astype(np.float32)
+    batch = CreditBatch(
+        inputs=jnp.asarray(rows),
+        episode_index=jnp.repeat(jnp.arange(100), lengths),
+        length=jnp.asarray(lengths),
+        mean_reward=jnp.asarray(returns / lengths),
+        mask=jnp.ones(100),
+        level=jnp.asarray(level),
+    )
+    state = init(jax.random.key(0), spec)
+    with float64():
+        state = state._replace(closed_form=learning.add_to_sums(state.closed_form, batch))
+        state = jax.jit(learning.fit_closed_form, static_argnums=1)(state, spec)
+    step_lengths = jnp.repeat(batch.length, lengths)
+    rewards = step_lengths * decoder_state.decoder_rewards(state, batch.inputs, spec, step_lengths)[:, 0]
+    assert abs(float(rewards.mean())) < 0.1
+    rest = state.closed_form.start_value[0] + state.closed_form.intercept[0][level]
+    np.testing.assert_allclose(rest, returns, atol=10)
+
+
 @pytest.mark.parametrize(
     ("method", "score", "n_values", "expected"),
     [

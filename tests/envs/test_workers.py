@@ -55,7 +55,7 @@ def wait_for_end(pid):
 def test_workers_equal_one_process():
     rng = np.random.default_rng(0)
     makers = [partial(ToyHostEnv, changes={"max_steps": 20})] * 5  # some are stepped after their end
-    with LocalVecEnv(makers) as local, SubprocVecEnv(makers, processes=2) as remote:
+    with LocalVecEnv(makers) as local, SubprocVecEnv(makers, processes=2, timeout=60.0) as remote:
         assert os.getpid() not in remote.pids
         assert len(set(remote.pids)) == 2
         assert remote.spec.teams == local.spec.teams
@@ -114,7 +114,7 @@ def test_timestep_is_checked(changes, message):
     assert (str(error.value), error.value.env_index) == (f"the environment: {message}", 1)
 
 
-@pytest.mark.parametrize("make_vec_env", [LocalVecEnv, partial(SubprocVecEnv, processes=1)])
+@pytest.mark.parametrize("make_vec_env", [LocalVecEnv, partial(SubprocVecEnv, processes=1, timeout=60.0)])
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
@@ -142,7 +142,7 @@ def test_error_of_an_environment(make_vec_env, fault, message):
 )
 def test_worker_that_fails(fault, timeout, message, monkeypatch):
     monkeypatch.setattr(workers, "STOP_TIMEOUT_S", 0.5)
-    envs = SubprocVecEnv([ToyHostEnv, ToyHostEnv, ToyHostEnv, partial(ToyHostEnv, fault)], processes=2)
+    envs = SubprocVecEnv([ToyHostEnv, ToyHostEnv, ToyHostEnv, partial(ToyHostEnv, fault)], processes=2, timeout=60.0)
     pids = envs.pids
     walk(envs, steps=2)
     envs.timeout, envs.stop_requested = timeout, lambda: "asked to stop" in message
@@ -174,7 +174,7 @@ def test_workers_end_before_their_directory(monkeypatch):
     )
     monkeypatch.setattr(workers, "open_shared_memory", watch)
     with pytest.raises(LareError, match=r"^environment 0 cannot be sent to a worker process: .*lambda"):
-        SubprocVecEnv([lambda: ToyHostEnv()] * 2, processes=2)
+        SubprocVecEnv([lambda: ToyHostEnv()] * 2, processes=2, timeout=60.0)
     assert ended == [True, True]
 
 
@@ -188,7 +188,7 @@ class StartsSimulator(ToyHostEnv):
 
 
 def test_simulator_of_an_environment_ends_with_a_worker_that_hangs(tmp_path):
-    envs = SubprocVecEnv([partial(StartsSimulator, tmp_path / "pid")])
+    envs = SubprocVecEnv([partial(StartsSimulator, tmp_path / "pid")], timeout=60.0)
     envs.timeout = 0.5
     pid = int((tmp_path / "pid").read_text())
     assert is_running(pid)
@@ -200,7 +200,7 @@ def test_simulator_of_an_environment_ends_with_a_worker_that_hangs(tmp_path):
 
 def test_close(tmp_path):
     notes = [tmp_path / name for name in ("first", "second")]
-    envs = SubprocVecEnv([partial(ToyHostEnv, note=str(note)) for note in notes], processes=1)
+    envs = SubprocVecEnv([partial(ToyHostEnv, note=str(note)) for note in notes], processes=1, timeout=60.0)
     pid = envs.pids[0]
     envs.close()
     assert [note.read_text() for note in notes] == ["closed", "closed"]
@@ -226,7 +226,7 @@ from helpers.host_envs import ToyHostEnv
 from lare_rl.envs.workers import SubprocVecEnv
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
-envs = SubprocVecEnv([partial(ToyHostEnv, sys.argv[1], seconds=0.05, changes={"max_steps": 10**6})] * 2, processes=2)
+envs = SubprocVecEnv([partial(ToyHostEnv, sys.argv[1], seconds=0.05, changes={"max_steps": 10**6})] * 2, processes=2, timeout=60.0)
 print(*envs.pids, flush=True)
 envs.reset(np.ones(2, bool), np.arange(2))
 while True:

@@ -95,7 +95,7 @@ def test_plain_lines():
     1 to 2: waiting people,
     by floor
     """
-    table = ["0: height; Min 0; Max 1; none", "1: speed; Max 3", "The rest.", "2: no head"]
+    table = ["0: height; Min 0; Max 1; Reward none", "1: speed; Max 3", "The rest.", "2: no head"]
     assert plain_lines(text) == [*table, "0: floor", "1 to 2: waiting people, by floor"]
 
 
@@ -106,10 +106,14 @@ def test_rewards_are_removed(tmp_path):
         "Tells of a chase.\nThe goal is to catch the *target*.\nSee the docs.\n1. Truncation: after 20 steps."
     )
     assert task.observation == "2 entries.\nA target.\nIt returns nothing."
-    assert task.action == "1 entry, between -2 and 2.\n1: The second row; -"
-    removed = "You get a reward of \alpha for each catch.", '0: guess a \\o/ """; no cost'
+    assert task.action == '1 entry, between -2 and 2.\n0: guess a \\o/ """\n1: The second row'
+    removed = (
+        "You get a reward of \alpha for each catch.",
+        '0: guess a \\o/ """; Reward no cost',
+        "1: The second row; Reward -",
+    )
     assert all(f"\n#   {one_line(text)}\n" in draft.toml for text in removed)
-    assert "2 sentences or rows" in draft.toml
+    assert "3 sentences or rows" in draft.toml
     assert "not used: rewards." in draft.toml
 
 

@@ -166,10 +166,10 @@ def test_every_folder_of_a_namespace_is_checked(write_run, tmp_path, monkeypatch
 def test_module_that_a_new_process_would_not_trust(monkeypatch):
     task = toy_spec(environment="helpers.toy_envs:toys/Chase-v0")
     trust.trust_environment(task)
-    assert trust.module_to_trust(task) == "helpers.toy_envs"
-    assert trust.module_to_trust(toy_spec(environment="Pendulum-v1")) is None
+    assert trust.trust_prefix(task) == "LARE_TRUST=helpers.toy_envs "
+    assert trust.trust_prefix(toy_spec(environment="Pendulum-v1")) == ""
     monkeypatch.setenv("LARE_TRUST", "helpers.toy_envs")
-    assert trust.module_to_trust(task) is None
+    assert trust.trust_prefix(task) == ""
 
 
 def test_train_ends_with_a_command_that_can_be_copied(write_run, command, monkeypatch):

@@ -14,10 +14,10 @@ from lare_rl.assigner.space_layout import SpaceLayout, make_layout
 from lare_rl.config.validity import check_credit, check_phi
 from lare_rl.credit.decoder_settings import CreditSettings, resolve_credit
 from lare_rl.credit.history import next_history_columns
-from lare_rl.credit.input_names import input_arrays
+from lare_rl.credit.input_names import N_EXTREMES, input_arrays
 from lare_rl.credit.methods import METHODS, Method
 from lare_rl.credit.spec import CreditSpec
-from lare_rl.envs.families import find_score_type
+from lare_rl.envs.families import find_score_key
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import CheckedModel, Count, LareError, short_repr
@@ -104,7 +104,9 @@ class AssignerConfig(CheckedModel):
     ) -> Float[np.ndarray, "n *agents all_inputs"]:
         """Return the inputs of successive steps with their history. `begins` is true for the first step of each episode."""
         n_tracked, size = self.spec.basis.n_tracked, inputs.shape[-1]
-        rows = np.concatenate([inputs, np.full((*inputs.shape[:-1], 3 * n_tracked), np.nan, np.float32)], axis=-1)
+        rows = np.concatenate(
+            [inputs, np.full((*inputs.shape[:-1], N_EXTREMES * n_tracked), np.nan, np.float32)], axis=-1
+        )
         for i in np.flatnonzero(~begins):
             if i:
                 rows[i, ..., size:] = next_history_columns(rows[i - 1], n_tracked)
@@ -134,7 +136,7 @@ def resolve_config(
     if phi is not None and not isinstance(phi, LatentFunction):
         raise LareError(f"phi is {short_repr(phi)}: give a function from lare_rl.design or lare_rl.load_function")
     settings = resolve_credit(settings, agents)
-    if settings.score == "auto" and task is not None and (score := find_score_type(task)) is not None:
+    if settings.score == "auto" and task is not None and (score := find_score_key(task)) is not None:
         settings = settings.model_copy(update={"score": score})
     observation, action = _resolve_layouts(task, spaces)
     return AssignerConfig(

@@ -15,7 +15,7 @@ from lare_rl.config.effective import describe_unused_settings
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.errors import LareError
 from lare_rl.runs.plan import RunPlan, load_config
-from lare_rl.tasks.trust import TRUST_VARIABLE, module_to_trust
+from lare_rl.tasks.trust import trust_prefix
 
 if TYPE_CHECKING:
     from lare_rl.latent.function import LatentFunction
@@ -90,9 +90,9 @@ def train(
     else:
         start, run_settings = _prepare(chosen_task, settings, function, out or plan.out, plan)
     run = start(tensorboard=tensorboard, listeners=_listeners(wandb, mlflow, run_settings))
-    module = module_to_trust(run.config.task)
-    trust = f"{TRUST_VARIABLE}={module} " if module else ""
-    print_line(f"finished {run.directory}; to see it: {trust}lare-rl report {shlex.quote(str(run.directory))}")
+    print_line(
+        f"finished {run.directory}; to see it: {trust_prefix(run.config.task)}lare-rl report {shlex.quote(str(run.directory))}"
+    )
 
 
 def _prepare(

@@ -10,7 +10,7 @@ from lare_rl.config.validity import check_training
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
 from lare_rl.credit.methods import METHODS, Fit
 from lare_rl.data.replay import required_capacity
-from lare_rl.envs.families import find_score_type
+from lare_rl.envs.families import find_score_key
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
@@ -122,7 +122,7 @@ def _normalise(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Reso
         changes["scale_rewards"] = False
     score, method = resolved.credit.score, METHODS.find(resolved.method)
     if score == "auto":
-        score = find_score_type(task) or score
+        score = find_score_key(task) or score
     is_fixed = env.fixed_length and task.payment_rule.is_regular(env.max_steps)
     if score != "binary" and is_fixed:
         score = "auto"  # sum and mean have the same decoder

@@ -11,6 +11,7 @@ from lare_rl.algorithms.registry import ALGORITHMS, Algorithm, AlgorithmSettings
 from lare_rl.config.effective import fits_separately, reads_old_steps
 from lare_rl.config.settings import ResolvedSettings
 from lare_rl.credit.decoder_settings import RECENT_STEPS, CreditSettings
+from lare_rl.credit.input_names import N_EXTREMES, NOT_RAW
 from lare_rl.credit.methods import METHODS, Method
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.data.replay import required_capacity
@@ -127,7 +128,7 @@ class CreditConfig:
         env, consumes = self.env, self.consumes
         is_replayed = consumes is not Consumes.ROLLOUTS
         inputs = self.credit_specs[0].inputs
-        has_raw_features = any(name not in ("factors", "history") for name in inputs)
+        has_raw_features = any(name not in NOT_RAW for name in inputs)
         observed = (env.n_agents, env.observation_size)
         actions = (env.n_agents, env.action_size)
         factors = (self.n_proxy_rewards, max(self.n_factors, default=0))
@@ -136,7 +137,7 @@ class CreditConfig:
             "observation": (is_replayed or (has_raw_features and not self.team_level), observed, np.float32),
             "action": (is_replayed or "action" in inputs, actions, np.float32),
             "factors": (self.method.needs_phi, factors, np.float32),
-            "history": (self.n_tracked > 0, (self.n_proxy_rewards, 3, self.n_tracked), np.float32),
+            "history": (self.n_tracked > 0, (self.n_proxy_rewards, N_EXTREMES, self.n_tracked), np.float32),
             "reward": (True, (env.n_agents,), np.float32),
             "state": (env.state_size > 0 and reads_state, (env.state_size,), np.float32),
             "available": (env.masks_actions and consumes is Consumes.SEQUENCES, actions, np.bool_),

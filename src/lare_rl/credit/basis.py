@@ -29,6 +29,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit.history import next_history
+from lare_rl.credit.input_names import N_EXTREMES
 
 __all__ = [
     "MAX_PAIRED_RAW_FEATURES",
@@ -75,7 +76,7 @@ class Basis:
     @property
     def n_inputs(self) -> int:
         """The size of an input row."""
-        return self.n_standardised + 3 * self.n_tracked
+        return self.n_standardised + N_EXTREMES * self.n_tracked
 
     @property
     def n_standardised(self) -> int:
@@ -140,6 +141,11 @@ class Basis:
     def n_columns(self) -> int:
         """The number of weights of a fit: those of features, of the steps so far or of 1/T, and an intercept for each level."""
         return self.n_features + (self.prefixes or self.start_value) + self.n_levels
+
+    @property
+    def first_level_column(self) -> int:
+        """The index of the first level's intercept among the weights."""
+        return self.n_columns - self.n_levels
 
     @property
     def column_group_index(self) -> Int[np.ndarray, " columns"]:

@@ -3,8 +3,8 @@
     r_hat = b + w . f(u)        (`linear_decoder.py`)
 
 w and b are computed from sums over episodes (`evidence.py`), without gradient descent. Episode k has T_k steps, the mean
-features m_k, the return R_k, and y_k = R_k / T_k, or R_k if the score is an average. In LaRe without a reward model
-(`lare-signs`), w are signs instead:
+features m_k, the return R_k, and y_k = R_k / T_k, or R_k if the score is an average. In `lare-signs` (the paper's LaRe without
+a decoder), w are signs instead:
 
     w = argmin sum_k T_k (R_k/T_k - w . m_k)^2  over  w in {-1, 1}^d,    b = 0,    f(u) = x
 
@@ -13,19 +13,22 @@ whose prior precision is set by the evidence, like that of a group of features:
 
     y_k = b + c_level(k) + w . m_k + noise,     c ~ N(0, 1 / alpha_levels)
 
-The intercept takes part in the prediction of a return, but no step is paid for it: an easy level does not credit what happens on it.
+The intercept takes part in the prediction of a return, but no step is paid for it: steps are not paid for the ease of their level.
 
 If episodes differ in length, a sum may have a start value c. An example is a score of 100% minus all losses: c is 100%. No step is
 paid for c. In a fit of R/T, it is the weight of 1/T, and the evidence sets its prior precision:
 
     R_k = c + sum_t (b + w . f_kt) + noise,     R_k / T_k = b + w . m_k + c / T_k + noise,     c ~ N(0, 1 / alpha_start)
 
+If returns are fitted to prefixes of episodes (`learning.py`), b is the weight of the number of steps, and the bias of the fit is V_0.
+
 The features depend on the mean and the std that standardise x. If these changed with every step, the sums over earlier steps would
 be wrong, so they are kept constant until the number of steps has grown by a half. Then they are updated, and all stored episodes are
 summed again.
 
 The sums need float64: if features are nearly collinear, float32 loses all precision. The stored state holds each number as the
-sum of two float32 numbers. Call functions that take or return `SufficientStatistics` within `float64()`.
+sum of two float32 numbers. Call all functions of this module that read or change the sums within
+`float64()` (`util/float64.py`).
 """
 
 import itertools
@@ -79,18 +82,19 @@ class ClosedForm(NamedTuple):
     sufficient_statistics: SufficientStatistics
     """Each number is held as two float32 numbers (`split_double`)."""
     n_steps: Float[Array, ""]
-    """The number of steps that mean and std were computed from."""
+    """The number of rows (one for each agent and step) that mean and std were computed from."""
     n_fitted: Float[Array, ""]
     """The number of episodes that the decoder is fitted to."""
     posterior: Posterior
     """The fit with a precision for each group of features, of each score type but log odds, along a leading axis."""
     strengths: Posterior
     """The fit with a precision of its own for each raw feature, and for its shapes (`relevance.py`), of the same score
-    types. The decoder has the weights of the better fit."""
+    types. A large precision switches a feature off. The decoder has the weights of the better fit."""
     intercept: Float[Array, "score_types levels"]
-    """The intercept of each level, for each score type: part of R/T for a score that is a sum, else of R."""
+    """The intercept of each level, for each score type: part of R/T for a sum that is not fitted to prefixes, else of R."""
     start_value: Float[Array, " score_types"]
-    """The part of R that no step is paid for and no level explains, for each score type; 0 if the bias of the decoder includes it."""
+    """The part of R that no step is paid for and no level explains, for each score type: V_0 if prefixes are fitted; 0 for a sum without
+    the column 1/T, and for an average of episodes of one length."""
     log_odds: LogOddsFit | None
     """The fit of log odds. Only present if the score may be of this type, which is then the last of the decoder's score types."""
 
@@ -131,20 +135,20 @@ def to_float64(statistics: SufficientStatistics) -> SufficientStatistics:
     return jax.tree.map(lambda number: jnp.sum(number.astype(float), axis=0), statistics)
 
 
-def is_stale(state: ClosedForm, statistics: RunningMeanStd) -> Bool[Array, ""]:
+def is_stale(state: ClosedForm, inputs: RunningMeanStd) -> Bool[Array, ""]:
     """Return whether all episodes must be summed again."""
-    return statistics.n_rows >= STATISTICS_GROWTH * state.n_steps
+    return inputs.n_rows >= STATISTICS_GROWTH * state.n_steps
 
 
-def reset_statistics(state: ClosedForm, statistics: RunningMeanStd) -> ClosedForm:
-    """Set the sums to zero, and standardise by the mean and std of all steps so far.
+def reset_statistics(state: ClosedForm, inputs: RunningMeanStd) -> ClosedForm:
+    """Set the sums to zero, and standardise by the mean and std of the inputs of all steps so far.
 
     Until the next fit, the weights do not match the features.
     """
     return state._replace(
-        decoder=eqx.tree_at(lambda d: (d.mean, d.std), state.decoder, (statistics.mean, running_std(statistics))),
+        decoder=eqx.tree_at(lambda d: (d.mean, d.std), state.decoder, (inputs.mean, running_std(inputs))),
         sufficient_statistics=jax.tree.map(jnp.zeros_like, state.sufficient_statistics),
-        n_steps=statistics.n_rows,
+        n_steps=inputs.n_rows,
         n_fitted=jnp.zeros_like(state.n_fitted),
         log_odds=None if state.log_odds is None else logistic.remove_episodes(state.log_odds),
     )
@@ -158,8 +162,8 @@ def is_due(state: ClosedForm) -> Bool[Array, ""]:
 class _Weights(NamedTuple):
     """The result of a fit, for some score types."""
 
-    columns: Float[Array, "score_types columns"]
-    """The weights that `Basis.n_columns` counts."""
+    weight: Float[Array, "score_types columns"]
+    """Of the features, of the number of steps or 1/T, and of the levels (`Basis.n_columns`)."""
     bias: Float[Array, " score_types"]
     start_value: Float[Array, " score_types"]
 
@@ -175,7 +179,7 @@ def fit(
     """Fit the decoder of each score type.
 
     If `vectorized` is true, the score types sum and average are fitted in one batch, else one after the other. If the score is an
-    average, and not all episodes have the same length (`fixed_length`), no step is paid for the mean return.
+    average and `fixed_length` (all episodes have the same length) is false, no step is paid for the mean return.
     """
     basis = state.decoder.basis
     groups, strengths = _fit_linear_types(state, score_types, max_rounds, vectorized=vectorized)
@@ -234,7 +238,7 @@ def _linear_weights(
     basis: Basis, groups: Posterior, strengths: Posterior, start_value_unit: Float[Array, ""]
 ) -> _Weights:
     best = relevance.select(strengths, groups, basis.column_group_index, basis.column_strength_index)
-    if basis.prefixes:  # b is the weight of the number of steps; the bias is V_0, which no step is paid for
+    if basis.prefixes:
         return _Weights(best.weight, best.weight[:, basis.n_features], best.bias)
     start_value = jnp.zeros_like(best.bias)
     if basis.start_value:
@@ -243,18 +247,21 @@ def _linear_weights(
 
 
 def _centre_average(state: ClosedForm, weights: _Weights, index: int) -> _Weights:
-    """Move the mean return from the rewards of an average to its start value.
+    """Move the mean of T r_hat from the rewards of an average to its start value.
 
     Otherwise T r_hat would be near the mean return at every step. If that is negative, each step costs something, and an agent that can end
     an episode learns to end it, although this does not raise the average.
     """
-    mean = jnp.sum(state.sufficient_statistics.mean[..., state.decoder.basis.n_columns + ScoreType.AVERAGE])
+    n_features, step_mean = state.decoder.basis.n_features, to_float64(state.sufficient_statistics).mean
+    mean = (
+        weights.bias[index] + weights.weight[index, :n_features] @ step_mean[:n_features]
+    )  # without the intercepts of levels
     bias, start_value = weights.bias.at[index].add(-mean), weights.start_value.at[index].add(mean)
     return weights._replace(bias=bias, start_value=start_value)
 
 
 def target_scale(state: ClosedForm, *, is_average: Bool[Array, ""], index: Int[Array, ""] | int) -> Float[Array, ""]:
-    """Return the root mean square of (R - start value)/T or, of an average, of R - start value. Call this within `float64()`.
+    """Return the root mean square of (R - start value)/T or, of an average, of R - start value.
 
     Episodes have the weight T. `index` is the position of the score type among all that are fitted.
     """
@@ -271,7 +278,7 @@ def target_scale(state: ClosedForm, *, is_average: Bool[Array, ""], index: Int[A
 def reward_std(
     state: ClosedForm, rows: Float[Array, "rows inputs"], score_types: tuple[int, ...], index: Int[Array, ""] | int
 ) -> Float[Array, " rows"]:
-    """Return the posterior standard deviation of r_hat, or of T r_hat if the score is an average. Call this within `float64()`.
+    """Return the posterior standard deviation of r_hat, or of T r_hat if the score is an average.
 
     Only after `fit`, not after `fit_signs`. `index` is the position of the score type among all that are fitted.
     """
@@ -308,10 +315,10 @@ def fit_signs(state: ClosedForm) -> ClosedForm:
 
 
 def _set_weights(state: ClosedForm, weights: _Weights) -> ClosedForm:
-    basis, (columns, bias, start_value) = state.decoder.basis, (values.astype(jnp.float32) for values in weights)
+    basis, (weight, bias, start_value) = state.decoder.basis, (values.astype(jnp.float32) for values in weights)
     return state._replace(
-        decoder=eqx.tree_at(lambda d: (d.weight, d.bias), state.decoder, (columns[:, : basis.n_features], bias)),
+        decoder=eqx.tree_at(lambda d: (d.weight, d.bias), state.decoder, (weight[:, : basis.n_features], bias)),
         n_fitted=jnp.sum(state.sufficient_statistics.n_episodes),
-        intercept=columns[:, basis.n_columns - basis.n_levels :],
+        intercept=weight[:, basis.first_level_column :],
         start_value=start_value,
     )

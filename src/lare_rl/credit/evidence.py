@@ -209,7 +209,7 @@ def fit(
 def starting_precisions(problem: Regression, start: Posterior) -> tuple[Float[Array, "3 alphas"], Float[Array, "3"]]:
     """Return alpha and beta of the three starts of `fit`."""
     equal = problem.equal_alpha, 2 * problem.dof / problem.q
-    earlier = jax.tree.map(lambda old, new: jnp.where(start.has_fit, old, new), (start.alpha, start.beta), equal)
+    earlier = select(start.has_fit, (start.alpha, start.beta), equal)
     first_group = (OTHER_GROUPS_LOSS * problem.equal_alpha).at[0].set(problem.equal_alpha[0] / FIRST_GROUP_GAIN)
     first_alone = first_group, problem.dof / (LOW_NOISE * problem.q)
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), earlier, equal, first_alone)

@@ -149,5 +149,4 @@ class GRD(eqx.Module):
 def _mean_sparsity(logits: Float[Array, "*edges 2"], selected: Bool[Array, "*edges"] | None = None) -> Float[Array, ""]:
     """Return the mean of -log P(C = 0) over the selected edges; 0 if there are none."""
     negative_log = jax.nn.softplus(logits[..., 0] - logits[..., 1])
-    selected = jnp.ones(negative_log.shape, bool) if selected is None else selected
-    return jnp.sum(selected * negative_log) / jnp.maximum(jnp.sum(selected), 1)
+    return masked_mean(negative_log, selected)

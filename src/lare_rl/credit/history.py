@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from lare_rl.credit.input_names import N_EXTREMES
 from lare_rl.envs.interface import AnyArray
 
 __all__ = ["next_history", "next_history_columns", "scan_history"]
@@ -33,7 +34,7 @@ def next_history_columns(
     row: Float[np.ndarray, "*batch inputs"], n_tracked: int
 ) -> Float[np.ndarray, "*batch history"]:
     """Return the history of the next step, from the inputs of a step: first its tracked entries, and last its own history."""
-    history = row[..., -3 * n_tracked :].reshape(*row.shape[:-1], 3, n_tracked)
+    history = row[..., -N_EXTREMES * n_tracked :].reshape(*row.shape[:-1], N_EXTREMES, n_tracked)
     return next_history(history, row[..., :n_tracked]).reshape(*row.shape[:-1], -1)
 
 

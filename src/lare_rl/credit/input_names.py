@@ -19,8 +19,12 @@ from typing import Any
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import ScoredObservation, entry_meanings, select_sides
 
-__all__ = ["InputNames", "input_arrays", "input_sizes", "raw_feature_names"]
+__all__ = ["NOT_RAW", "N_EXTREMES", "InputNames", "input_arrays", "input_sizes", "raw_feature_names"]
 
+NOT_RAW = "factors", "history"
+"""The inputs that are no raw features."""
+N_EXTREMES = 3
+"""The number of values of a history for each entry: largest, smallest and last."""
 _NAMES = "factors", "observation", "action", "next_observation", "observation_change", "scored_observation", "history"
 
 
@@ -57,8 +61,8 @@ class InputNames:
 
     @property
     def has_raw_features(self) -> bool:
-        """Whether the inputs contain anything else than factors."""
-        return self.names != ("factors",)
+        """Whether the inputs contain anything else than factors and their history."""
+        return not set(self.names) <= set(NOT_RAW)
 
 
 def input_sizes(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> tuple[tuple[str, int], ...]:
@@ -70,7 +74,7 @@ def input_sizes(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> tuple[tupl
     named = [(name, {**sizes, **observation}[name]) for name in inputs if name != "history"]
     if "history" in inputs:
         n_tracked = sizes["factors"] if "factors" in inputs else sum(size for _, size in named)
-        named.append(("history", 3 * n_tracked))
+        named.append(("history", N_EXTREMES * n_tracked))
     return tuple(named)
 
 

@@ -103,7 +103,7 @@ def _episode_sums(
 ) -> Float[Array, "episodes columns"]:
     """Return the sums of the features of each episode, from their means, and which level it has."""
     index, basis = np.arange(columns.shape[1]), decoder.basis
-    is_feature, is_level = index < basis.n_features, index >= basis.n_columns - basis.n_levels
+    is_feature, is_level = index < basis.n_features, index >= basis.first_level_column
     return columns * jnp.where(is_feature, episodes.length[:, None], is_level)  # without 1/T
 
 

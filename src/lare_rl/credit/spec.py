@@ -6,7 +6,7 @@ from functools import cached_property
 
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.input_names import input_sizes, raw_feature_names
+from lare_rl.credit.input_names import N_EXTREMES, NOT_RAW, input_sizes, raw_feature_names
 from lare_rl.credit.methods import Fit, Method
 from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
 from lare_rl.credit.score_type import ScoreType
@@ -29,6 +29,7 @@ class CreditSpec:
     action_size: int
     scored_observation: ScoredObservation = "after"
     single_agent: bool
+    """Whether the environment has a single agent, and credit is not to the global state. If false, `agents` may still be 1."""
     agents: int
     """The number of proxy rewards of a step."""
     max_steps: int
@@ -37,7 +38,7 @@ class CreditSpec:
     """Whether all episodes have the same length. A sum and an average are then the same."""
     payments: PaymentRule = PAID_AT_END
     has_groups: bool = False
-    """Whether episodes may belong to groups, whose returns differ in level."""
+    """Whether episodes may belong to levels (for users: groups), each with its own intercept."""
     scale_rewards: bool = False
     """Whether training rewards are divided by the running root mean square of R/T."""
 
@@ -47,9 +48,9 @@ class CreditSpec:
         return self.settings.exact in ("last", "spread") and "exact" in self.method.settings
 
     @property
-    def window(self) -> int:
-        """The number of last payments over which predictions of them are assessed: more if a single one says little."""
-        return WINDOW if self.payments.only_at_end and self.settings.score != "binary" else SEGMENT_WINDOW
+    def n_assessed(self) -> int:
+        """The number of last returns (or payments) over which R^2 and gain are computed (`prequential.py`)."""
+        return SEGMENT_WINDOW if self.payments.pays_early or self.settings.score == "binary" else WINDOW
 
     @property
     def n_levels(self) -> int:
@@ -70,7 +71,7 @@ class CreditSpec:
 
     @property
     def _raw_sizes(self) -> dict[str, int]:
-        return {name: size for name, size in self.input_sizes if name not in ("factors", "history")}
+        return {name: size for name, size in self.input_sizes if name not in NOT_RAW}
 
     @cached_property
     def basis(self) -> Basis:
@@ -80,7 +81,7 @@ class CreditSpec:
             n_factors=sizes.get("factors", 0),
             n_raw=sum(self._raw_sizes.values()),
             extended=self.method.decoder_kind.extended_basis,
-            n_tracked=sizes.get("history", 0) // 3,
+            n_tracked=sizes.get("history", 0) // N_EXTREMES,
             n_levels=0 if self.method.fit is Fit.SIGNS else self.n_levels,
             prefixes=self.method.fit is Fit.PREFIX_EVIDENCE,
             start_value=self.method.has_start_value(self.settings, fixed_length=self.fixed_length),
@@ -88,7 +89,7 @@ class CreditSpec:
 
     @cached_property
     def score_types(self) -> tuple[ScoreType, ...]:
-        """The score types that are fitted, in the order of their values. Without features, no fit in closed form can compare them."""
+        """The score types that are fitted, in the order of `ScoreType`. Without features, no fit in closed form can compare them."""
         score = self.settings.score
         if "score" not in self.method.settings or not self.basis.n_features:
             return (ScoreType.SUM,)
@@ -99,7 +100,11 @@ class CreditSpec:
 
     @property
     def has_closed_form(self) -> bool:
-        """Whether there is a fit in closed form: it is the decoder, or it determines the type of a score or the mean of averages."""
+        """Whether there is a fit in closed form.
+
+        It is the decoder, or it helps a gradient decoder: it compares score types, or gives the mean return of an average, which no step is
+        paid for.
+        """
         return self.method.fit is not None and (self.method.fit.closed_form or self.score_types != (ScoreType.SUM,))
 
     @property
@@ -122,10 +127,10 @@ class CreditSpec:
 
     @property
     def output_scale(self) -> float:
-        """The factor sqrt(nT) of a decoder's output for n agents, or 1 for a single agent. T is the longest episode.
+        """The factor sqrt(nT) of a decoder's output for n agents, or 1 for a single agent. T is `max_steps`.
 
-        R/T is the mean of nT rewards, and a rare reward of a few agents is larger than this mean by about that factor. An update of Adam
-        changes the output by about the same amount, whatever the unit of the targets is. The decoder of many agents has few updates.
+        R/T is the mean of nT rewards. A reward that is paid sqrt(nT) times among them is larger than this mean by that factor. An update of
+        Adam changes the output by about the same amount, whatever the unit of the targets is. The decoder of many agents has few updates.
         Without this factor, its output would reach the size of a rare reward only after dozens of updates of the policy.
         """
         return 1.0 if self.agents == 1 else math.sqrt(self.max_steps * self.agents)

@@ -23,7 +23,7 @@ __all__ = [
     "Family",
     "check_logs",
     "find_family",
-    "find_score_type",
+    "find_score_key",
     "make_env",
     "make_local_env",
     "picklable_maker",
@@ -94,8 +94,8 @@ register_family("jumanji", "lare_rl.envs.jumanji_env:make", **_SINGLE_AGENT)
 register_family("jaxmarl", "lare_rl.envs.jaxmarl_env:make", reads=OPTIONAL_KEYS)
 
 
-def find_score_type(task: TaskSpec) -> str | None:
-    """Return the form of a return, such as "sum" or "average" over its steps, that the task or else its family names, or None."""
+def find_score_key(task: TaskSpec) -> str | None:
+    """Return the task's score ("sum", "average" or "binary"), or else its family's. None if neither has one."""
     return task.score or find_family(task).score
 
 
@@ -148,13 +148,15 @@ def make_local_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
 
 
 def picklable_maker(task: TaskSpec) -> Callable[[], HostEnv]:
-    """Return a function that makes a task's environment in another process, where it first imports the module of its family."""
-    return partial(_import_and_make, find_family(task).module, task)
+    """Return a picklable function. In another process, it imports the module of the family's maker, then makes the environment."""
+    return partial(_import_and_make, find_family(task), task)
 
 
-def _import_and_make(module: str, task: TaskSpec) -> HostEnv:
-    if module != "__main__":
-        importlib.import_module(module)
+def _import_and_make(family: Family, task: TaskSpec) -> HostEnv:
+    if family.module != "__main__":
+        importlib.import_module(family.module)
+        if task.family and find_family(task) is GYMNASIUM and family != GYMNASIUM:
+            FAMILIES.register(task.family, family)  # another module than the maker's registers it in the parent process
     elif task.family not in FAMILIES:
         raise LareError(
             f"{task.environment}: a worker process cannot import the script that registers {task.family!r}. "
@@ -164,11 +166,11 @@ def _import_and_make(module: str, task: TaskSpec) -> HostEnv:
 
 
 def check_logs(task: TaskSpec) -> None:
-    """Raise `LareError` if a task with logs only has keys that need an environment."""
+    """Raise `LareError` if a task without an environment sets keys that need one."""
     _check_keys(task, _LOGS_ONLY)
-    defaults = {"teams": (), "team": None, "measures": (), "credit_scope": "observation"}
-    for key, default in defaults.items():
-        if getattr(task, key) != default:
+    keys = "teams", "team", "measures", "credit_scope", "evaluation_environment", "processes", "timeout"
+    for key in keys:
+        if getattr(task, key) != TaskSpec.model_fields[key].get_default(call_default_factory=True):
             raise LareError(f"task {task.name!r}: {key} has no effect on logs. Remove it.")
 
 
@@ -195,7 +197,8 @@ def _check_keys(task: TaskSpec, family: Family) -> None:
                     advice = "Remove it, and pass kwargs to gymnasium.register."
                 elif not str(family.maker).startswith("lare_rl."):
                     advice = f"Remove it, or pass reads=({key!r},) to register_family, if its maker reads it."
-                raise LareError(f"task {role.name!r}: {key} has no effect on {task.environment}. {advice}")
+                target = "logs" if family is _LOGS_ONLY else task.environment
+                raise LareError(f"task {role.name!r}: {key} has no effect on {target}. {advice}")
     if not task.teams:
         return
     for key in ("agents", "team"):
@@ -225,7 +228,8 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
         _expect(task, "max_episode_steps", spec.max_steps, f"{spec.max_steps} in {task.environment}. Remove it.")
     for name in task.info_keys:
         if name not in spec.measures:
-            raise _mismatch_error(task, f"{task.environment} has no measure {name!r}")
+            kind = "group" if name == task.group else "measure"
+            raise _mismatch_error(task, f"{task.environment} has no {kind} {name!r} in info")
     if task.credit_scope == "state" and not spec.state_size:
         raise _mismatch_error(task, f"credit_scope = 'state', but {task.environment} has no global state")
     for role in task.roles:

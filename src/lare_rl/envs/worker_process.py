@@ -41,9 +41,9 @@ CLOSE_TIMEOUT_S = 2.0
 class Worker:
     """A worker process and its environments, from the parent's side."""
 
-    def __init__(self, memory: str, worker_index: int):
+    def __init__(self, prefix: str, worker_index: int):
         """Start the process, which listens at a socket beside the shared memory; on Windows, at a named pipe."""
-        self._address = f"{memory}socket{worker_index}"
+        self._address = f"{prefix}socket{worker_index}"
         if sys.platform == "win32":
             self._address = rf"\\.\pipe\{self._address}"
         self.env_indices: Sequence[int] = ()
@@ -65,13 +65,13 @@ class Worker:
             [sys.executable, "-P", "-c", PROGRAM, self._address], stdin=subprocess.PIPE, env=variables, **own_session()
         )
 
-    def start_making(self, makers: Mapping[int, Maker], memory: str, worker_index: int) -> None:
-        """Make the environments if there are none. Number them by the keys of `makers`, and use this memory from now on."""
-        self.env_indices, self._current = list(makers), map_current(memory, worker_index)
+    def start_making(self, makers: Mapping[int, Maker], prefix: str, worker_index: int) -> None:
+        """Make the environments if there are none. Number them by the keys of `makers`. From now on, use the memory of this prefix."""
+        self.env_indices, self._current = list(makers), map_current(prefix, worker_index)
         self._current[0] = self.env_indices[0]
         self._connect()
         pickled = [] if self.specs else [pickle_maker(index, maker) for index, maker in makers.items()]
-        self.send("make", (memory, worker_index, self.env_indices, pickled))
+        self.send("make", (prefix, worker_index, self.env_indices, pickled))
 
     def _connect(self) -> None:
         """Connect to the process as soon as it listens, unless it is connected. Raises `LareError` if it ends or takes too long."""
@@ -91,7 +91,7 @@ class Worker:
         """The environment that the worker calls, and the process, for messages."""
         return f"environment {self._current[0]} (in worker process {self.process.pid})"
 
-    def measure_idle_s(self) -> float:
+    def seconds_at_env(self) -> float:
         """Return the time (s) since the worker was first seen at its present environment."""
         if self._current[0] != self._last_index:
             self.last_active, self._last_index = time.monotonic(), int(self._current[0])
@@ -202,11 +202,11 @@ class _EnvServer:
         return None
 
     def _make(
-        self, memory: str, worker_index: int, env_indices: Sequence[int], makers: Sequence[bytes]
+        self, prefix: str, worker_index: int, env_indices: Sequence[int], makers: Sequence[bytes]
     ) -> tuple[tuple[EnvSpec, ...], float]:
         """Make the environments if there are makers, else number those that exist. Return the specifications and the time (s)."""
         start = time.perf_counter()
-        self._current = map_current(memory, worker_index)
+        self._current = map_current(prefix, worker_index)
         self.envs = dict(zip(env_indices, self.envs.values(), strict=False))
         for index, pickled in zip(env_indices, makers, strict=False):
             self._current[0] = index

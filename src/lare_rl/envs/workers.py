@@ -1,6 +1,6 @@
 """Environments that step in several worker processes (`worker_process.py`), in lockstep.
 
-Gymnasium's AsyncVectorEnv has a process for each environment, steps all or none, and does not say which process died.
+Gymnasium's AsyncVectorEnv has a process for each environment, cannot step only some of them, and does not say which process died.
 """
 
 import atexit
@@ -44,17 +44,15 @@ def close_idle_workers() -> None:
 class SubprocVecEnv(VecEnv):
     """Environments in separate processes, several in each process if there are more environments than cores."""
 
-    def __init__(
-        self, makers: Sequence[Maker], processes: int | None = None, timeout: float = 60.0, reuse_key: str = ""
-    ):
+    def __init__(self, makers: Sequence[Maker], processes: int | None = None, *, timeout: float, reuse_key: str = ""):
         """Start the processes and make the environments.
 
         Args:
             makers: one function for each environment. It must be possible to pickle them.
             processes: the number of processes. Default: the number of cores, but at most one for each environment.
             timeout: the time (s) within which an environment must reply.
-            reuse_key: each environment has its own process, and when the batch is closed, the processes wait for the next batch
-                with this key. Empty: they end.
+            reuse_key: batches with the same key must have the same makers. Each environment then has its own process, whatever
+                `processes` is, which waits for the next batch after `close`. Empty: processes end.
 
         Raises `LareError` if an environment cannot be made. Later calls raise it if an environment fails, dies or does not reply in
         time. All workers have then ended.
@@ -64,25 +62,25 @@ class SubprocVecEnv(VecEnv):
         n_envs = len(makers)
         n_workers = n_envs if reuse_key else min(n_envs, processes or n_usable_cores())
         try:
-            with open_shared_memory() as memory, self._kill_after_error():
+            with open_shared_memory() as prefix, self._kill_after_error():
                 for worker_index in range(n_workers):
-                    self._workers.append(_find_idle_worker(reuse_key) or Worker(memory, worker_index))
-                specs = self._make_envs(makers, memory)
-                self._shared = map_arrays(memory, specs[0], n_envs)
+                    self._workers.append(_find_idle_worker(reuse_key) or Worker(prefix, worker_index))
+                specs = self._make_envs(makers, prefix)
+                self._shared = map_arrays(prefix, specs[0], n_envs)
                 self._shared.batch.available[:] = True
                 for worker in self._workers:
-                    worker.send("share", (memory, specs[0], n_envs))
+                    worker.send("share", (prefix, specs[0], n_envs))
                 self._receive("share")
                 super().__init__(specs[0], self._shared.batch)
         except OSError as error:
             raise LareError(f"worker processes cannot be started: {error}") from error
 
-    def _make_envs(self, makers: Sequence[Maker], memory: str) -> list[EnvSpec]:
+    def _make_envs(self, makers: Sequence[Maker], prefix: str) -> list[EnvSpec]:
         """Make the environments that the workers do not have yet. Return the specifications of all."""
         n_workers = len(self._workers)
         for worker_index, worker in enumerate(self._workers):
             indices = range(worker_index, len(makers), n_workers)
-            worker.start_making({index: makers[index] for index in indices}, memory, worker_index)
+            worker.start_making({index: makers[index] for index in indices}, prefix, worker_index)
         for worker, (specs, make_s) in self._receive("make"):
             worker.specs, worker.make_s = specs, max(worker.make_s, make_s)
         specs = [self._workers[index % n_workers].specs[index // n_workers] for index in range(len(makers))]
@@ -105,7 +103,7 @@ class SubprocVecEnv(VecEnv):
             return self._receive("step")[0][1]
 
     def find_interference(self, maker: Maker, timeout: float) -> str | None:
-        """Make a second environment beside the only one, in its process. Return what goes wrong, or None.
+        """Make a second environment in the process of the only one. Return what goes wrong, or None.
 
         The workers end after this, because the second environment may have changed their process. Raises `LareError` if the process
         dies, or does not reply within `timeout` (s).
@@ -156,15 +154,17 @@ class SubprocVecEnv(VecEnv):
                 if worker.connection in ready:
                     replies.append((worker, worker.receive()))
                 elif time.monotonic() > self._latest_reply(worker, stopped_at):
-                    seconds, advice = self.timeout, "if it needs longer, set timeout in the task file"
-                    if stopped_at < math.inf:
-                        seconds, advice = STOP_TIMEOUT_S, "the run was asked to stop, and cannot be saved"
-                    raise LareError(f"{worker.label} did not reply for {seconds:g} s in {command}; {advice}")
+                    seconds, advice = worker.seconds_at_env(), "; if it needs longer, set timeout in the task file"
+                    if seconds < self.timeout:
+                        advice = "; the run was asked to stop, and cannot be saved"
+                    elif command == "a second environment":
+                        advice = ""
+                    raise LareError(f"{worker.label} did not reply for {seconds:.1f} s in {command}{advice}")
         return replies
 
     def _latest_reply(self, worker: Worker, stopped_at: float) -> float:
         """Return the time at which a worker is given up. After a request to stop it has `STOP_TIMEOUT_S`."""
-        active_at = time.monotonic() - worker.measure_idle_s()
+        active_at = time.monotonic() - worker.seconds_at_env()
         return min(active_at + self.timeout, max(active_at, stopped_at) + STOP_TIMEOUT_S)
 
     def close(self) -> None:

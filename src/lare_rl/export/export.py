@@ -3,7 +3,7 @@
 DIRECTORY/
   export.json                task, method, algorithm, seed, the policy's step; inputs, outputs and operations of each function
   policy.npz, .onnx          observation -> action (other inputs and outputs: `policy_graph.py`); .onnx if onnx is installed
-  reward.npz, .onnx          steps -> r_hat, phi and decoder as one function; one reward_TEAM each if several teams learn
+  reward.npz, .onnx          steps -> r_hat (phi and decoder as one function); one reward_TEAM each if several teams learn
   latent_function.py, .json  the source of phi, and how it was made; one latent_function_TEAM each if several teams learn
   exported.py, evaluate.py   NumPy code that evaluates the functions in export.json and the .npz files
 
@@ -47,14 +47,14 @@ class ExportResult(NamedTuple):
 def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, best: bool = False) -> ExportResult:
     """Write the policy and the reward functions of a seed to a directory.
 
-    The policy acts without noise: of choices, it returns the most likely one. PPO and IPPO with discrete actions also return the logits.
-    Rewards are those of the last checkpoint's decoder, in the unit of the return (of `llm-reward`: as the function returns them).
+    The policy acts without noise: of choices, it returns the most likely one. Algorithms with a function `logits` (PPO, IPPO) also return
+    the logits of choices. Rewards are those of the last checkpoint's decoder; their unit: `reward_graph.py`.
 
     Args:
         run: the run, or its directory.
         out: the directory to write, which must not exist.
         seed: one of the run's seeds; the default is the first.
-        best: write the policy of the seed's best evaluation, instead of the last policy. Proxy rewards are always the last ones.
+        best: write the policy of the seed's best evaluation, instead of the last policy.
 
     Raises:
         LareError: there is no such seed, no checkpoint or no best policy, the policy has an operation that cannot be exported, or the

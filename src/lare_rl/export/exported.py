@@ -2,7 +2,7 @@
 
     import exported
     action = exported.load("policy")(observation=observation)["action"]
-    r_hat = exported.reward(before, action, after)  # and length=STEPS of the episode, if `export.json` lists it
+    r_hat = exported.reward(before, action, after)  # and length=STEPS that the payment is for, if `export.json` lists it
 
 `export.json` lists the inputs and outputs of each function, with their shapes. Their first axis is the batch. If all inputs are
 single rows, without this axis, the outputs have no batch axis either.
@@ -73,7 +73,7 @@ def load(name):
         needed = ", ".join(entry["inputs"])
         if missing := [key for key in entry["inputs"] if key not in inputs]:
             length = (
-                " (length is the number of steps of the episode, or that its payment is for)"
+                " (length is the number of steps that the payment is for: of the episode, if it is paid once)"
                 if "length" in missing
                 else ""
             )

@@ -24,7 +24,7 @@ class Model(Protocol):
 
     @property
     def name(self) -> str:
-        """The name that a function's provenance has."""
+        """The name that is saved with `phi`, as that of the model that wrote it."""
         ...
 
     def reply(self, messages: Sequence[Message], number: int) -> str:
@@ -53,7 +53,8 @@ class FunctionModel:
 def ask(model: Model, messages: Sequence[Message], number: int = 0) -> str:
     """Return a model's reply, which a file can store.
 
-    Raises `LareError` for any error of the model, and if the reply is no text: earlier replies, which were paid for, must not be lost.
+    Raises `LareError` for any error of the model, and if the reply is no text. A caller that catches it keeps the earlier replies, which
+    were paid for.
     """
     try:
         text: object = model.reply(messages, number)
@@ -67,7 +68,7 @@ def ask(model: Model, messages: Sequence[Message], number: int = 0) -> str:
 
 
 def as_model(model: Any) -> Model:
-    """Return a model, or the model that a function is. Raises `LareError` for anything else."""
+    """Return a model unchanged, and a function as a `FunctionModel`. Raises `LareError` for anything else."""
     if isinstance(model, Model):
         if isinstance(model.name, str):
             return model

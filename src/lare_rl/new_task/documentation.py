@@ -28,7 +28,7 @@ REWARD_WORDS = re.compile(
 """Words about rewards, which the language model must not read: it must find out what matters, not copy the reward."""
 
 MIN_WORDS = 8
-"""The start of a sentence is only kept if it has at least this number of words."""
+"""What precedes the clause about rewards is kept only if it has at least this number of words."""
 
 SENTENCE_END = re.compile(r"(?<=[^\d][.!?])\s+(?=[A-Z`*])")
 
@@ -47,7 +47,7 @@ TITLES = {
 }
 """Titles of the section from which a text is taken: the first of them that the documentation has."""
 EPISODE_END_TITLES = ("episode end", "episode termination", "termination")
-"""The same for the end of an episode, which the description mentions last."""
+"""The same for the section that `write_texts` appends to the description."""
 
 
 def split_sections(documentation: str) -> dict[str, str]:
@@ -87,7 +87,8 @@ def write_texts(
 ) -> tuple[dict[str, str], tuple[str, ...]]:
     """Return the texts of a task file, and the lines that were removed because they mention rewards.
 
-    `lines` are the lines of each text, by its key. The first section about the end of an episode is appended to the description.
+    `lines` are the lines of each text, by its key. The first section about the end of an episode is appended to the description, if
+    there is one.
     """
     cleaned = {key: remove_rewards(text) for key, text in lines.items()}
     texts = {key: text for key, (text, _) in cleaned.items()}
@@ -119,20 +120,24 @@ def plain_lines(text: str) -> list[str]:
 
 
 def _remove_markup(line: str) -> str:
-    line = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", line).replace("**", "").replace("`", "").strip()
+    line = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", line)
+    line = re.sub(
+        r"(`[^`]*`)|\*\*(?=\S)(.+?)(?<=\S)\*\*", lambda match: match[1] or match[2], line
+    )  # a power in code stays
+    line = line.replace("`", "").strip()
     return re.sub(r"\$?\\?[a-z]*\{?\\infty\}?\$?", "inf", line)
 
 
 def _table_lines(table: Sequence[str]) -> list[str]:
     """Return the rows of a table as text: the first cell, a colon, and the other cells.
 
-    Cells from the third on follow the title of their column, unless the title mentions rewards.
+    Cells from the third on follow the title of their column, and so do all cells under a title that mentions rewards.
     """
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table]
     titles: list[str] = []
     if len(rows) > 1 and _is_separator(rows[1]):
         head, *rows = rows
-        titles = ["" if column < 2 or REWARD_WORDS.search(title) else f"{title} " for column, title in enumerate(head)]
+        titles = [f"{title} " if i > 1 or REWARD_WORDS.search(title) else "" for i, title in enumerate(head)]
     lines = []
     for cells in rows:
         if not _is_separator(cells):
@@ -155,7 +160,13 @@ def remove_rewards(lines: Sequence[str]) -> tuple[str, tuple[str, ...]]:
 
 
 def _remove_reward_clause(line: str) -> str:
-    """Return a line up to the clause that mentions rewards, or an empty text if too little is left for a sentence."""
+    """Return a line without what mentions rewards.
+
+    The row of a table loses its cells about rewards. A sentence ends before the clause about rewards, or is empty if too little is left.
+    """
+    first, *cells = line.split("; ")
+    if ": " in first and not REWARD_WORDS.search(first):  # the row of a table
+        line = "; ".join([first, *(cell for cell in cells if not REWARD_WORDS.search(cell))])
     match = REWARD_WORDS.search(line)
     if match is None:
         return line

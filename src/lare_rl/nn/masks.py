@@ -14,7 +14,7 @@ Tree = TypeVar("Tree")
 def masked_mean(
     x: Float[Array, "*shape"], mask: Num[Array, "*shape"] | Bool[Array, "*shape"] | None
 ) -> Float[Array, ""]:
-    """Return the mean of x where `mask` is 1, or 0 if it is 1 nowhere. Without a mask, return the mean of all.
+    """Return the mean of x where `mask` is 1. If it is 1 nowhere, return 0. Without a mask, return the mean of all.
 
     `mask` is 0 or 1. Where it is 0, x must be finite.
     """
@@ -22,9 +22,10 @@ def masked_mean(
 
 
 def select(mask: Bool[Array, "*lead"], new: Tree, old: Tree) -> Tree:
-    """Return the rows of `new` where `mask` is true, and those of `old` elsewhere. The arrays have the mask's axes first.
+    """Return the rows of `new` where `mask` is true, and those of `old` elsewhere. Arrays of `old` have the mask's axes first.
 
-    Arrays of `old` without these axes stay: some simulators have buffers that all rows share.
+    Arrays of `new` may lack the last of these axes: they are then the same for all rows. Arrays of `old` without these axes stay: some
+    simulators have buffers that all rows share.
     """
 
     def choose(new: Array, old: Array) -> Array:

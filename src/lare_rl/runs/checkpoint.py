@@ -3,6 +3,7 @@
     checkpoint/
       rows-0.npz, rows-1.npz, ...   the replay's rows, from old to new
       state.npz                     everything else, and the list of the row files in use
+      best.npz                      the best policies (`best_policy.py`)
 
 A row file never changes. It is deleted when no row of it is in the replay any more. A new `state.npz` replaces the old file when it is
 complete. So `state.npz` always lists complete row files. No file contains a pickle.
@@ -18,7 +19,7 @@ import jax
 import numpy as np
 
 from lare_rl.errors import LareError, short_repr
-from lare_rl.runs.metrics_file import MAX_INTEGER
+from lare_rl.runs.metrics_file import is_count
 from lare_rl.util.files import make_directory, remove_partial_files, replace_npz
 from lare_rl.util.npz import DAMAGED_FILE_ERRORS, open_npz, report_damage
 from lare_rl.util.renamed_fields import rename_fields
@@ -30,7 +31,7 @@ __all__ = ["STATE_FILE", "fill_template", "load", "named_leaves", "read_metadata
 STATE_FILE = "state.npz"
 METADATA, ROW_FILES = "host", "segments"
 """The names in `state.npz` of the metadata and of the list of row files, both in JSON. The names of a state's arrays begin with a dot.
-Files of all versions have these two names."""
+Both values are old words, kept so that files of all versions can be read: they are not the host and the segments of the glossary."""
 REPLAY = ".replay."
 """The path of the replay within the state."""
 SAVED_BY_ROW = f"{REPLAY}columns"
@@ -48,7 +49,8 @@ ZERO_IF_GROUP_IS_MISSING = ".statistics.", ".return_scale.", ".predictions."
 State = TypeVar("State")
 """A training state with a replay: `replay.columns` are arrays of [seeds envs rows ...], which are saved by row.
 
-`replay.next_row` is the number of rows ever written. Each row is stored at its number modulo the capacity.
+`replay.next_row` is the number of the row of the next step, which may hold an observation already. It falls when an episode is dropped.
+Rows are stored as in `data/replay.py`.
 """
 
 
@@ -88,6 +90,7 @@ def take_snapshot(
         metadata: other data to save as JSON, with the number of the `step`.
         arrays: other data to save, as arrays. Their names must not begin with a dot, or be `METADATA` or `ROW_FILES`.
     """
+    # The next step's row is the newest one with an observation.
     capacity, newest_row = _capacity(learner), np.asarray(learner.replay.next_row)
     start, row_files = np.zeros_like(newest_row), []
     if (directory / STATE_FILE).exists():
@@ -247,9 +250,11 @@ def _capacity(learner: Any) -> int:
 
 
 def _parse_metadata(text: Any) -> dict[str, Any]:
-    """Read the metadata from JSON. Raise `ValueError` or `KeyError` if they are not valid."""
+    """Read the metadata from JSON. Raises one of `DAMAGED_FILE_ERRORS` if they are not valid."""
     metadata = read_json_object(str(text))
-    _check_counts([metadata["step"], metadata.get("metrics_length", 0)])
+    for value in (metadata["step"], metadata.get("metrics_length", 0)):
+        if not is_count(value):
+            raise ValueError(f"{short_repr(value)} is not a count")
     digests = metadata.get("function_sha256", [])
     if not (isinstance(digests, list) and all(isinstance(digest, str) for digest in digests)):
         raise ValueError("function_sha256 is no list of texts")
@@ -257,15 +262,15 @@ def _parse_metadata(text: Any) -> dict[str, Any]:
 
 
 def _parse_row_files(text: Any) -> list[_RowFile]:
-    """Read the list of row files from JSON. Raise `ValueError` if it is not valid."""
+    """Read the list of row files from JSON. Raises one of `DAMAGED_FILE_ERRORS` if it is not valid."""
     names = ("number", "start", "count")
     return [_RowFile(**{name: _check_counts(values[name]) for name in names}) for values in read_json(str(text))]
 
 
 def _check_counts(value: Any) -> Any:
-    """Return a count, or nested lists of counts, unchanged. Raise `ValueError` for anything else."""
+    """Return a whole number from 0 to `MAX_INTEGER`, or nested lists of them, unchanged. Raise `ValueError` for anything else."""
     if isinstance(value, list):
         return [_check_counts(element) for element in value]
-    if type(value) is not int or not 0 <= value <= MAX_INTEGER:
+    if not is_count(value):
         raise ValueError(f"{short_repr(value)} is not a count")
     return value

@@ -43,7 +43,7 @@ class Config(CheckedModel):
     versions: dict[str, str]
     machine: str
     ended_at: tuple[int, ...] = ()
-    """The run's number of steps before each extension."""
+    """The number of steps that was planned before each extension (`extend_run`). The run may have stopped earlier."""
 
 
 def make_config(task: TaskSpec, settings: ResolvedSettings, functions: Sequence[LatentFunction]) -> Config:
@@ -87,7 +87,7 @@ def read_config(directory: Path) -> Config:
     Raises `LareError` if the directory is not a run, or its configuration is not valid.
     """
     path = directory / CONFIG
-    if not path.is_file():
+    if not os.path.isfile(path):  # False also for a name that is too long, where Path.is_file raises an error
         raise LareError(f"{directory} is not a run: there is no {CONFIG} in it")
     values = read_table(path, MAX_CONFIG_BYTES)
     try:

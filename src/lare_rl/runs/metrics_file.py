@@ -12,7 +12,7 @@ from lare_rl.util.files import report_write_error
 from lare_rl.util.renamed_fields import rename_metrics
 from lare_rl.util.safe_io import read_json, read_text
 
-__all__ = ["MAX_INTEGER", "append_metrics", "read_metrics", "truncate_metrics"]
+__all__ = ["append_metrics", "is_count", "read_metrics", "truncate_metrics"]
 
 METRICS_FILE = "metrics.jsonl"
 MAX_METRICS_BYTES = 512 << 20
@@ -74,11 +74,16 @@ def _parse_lines(path: Path, version: tuple[int, ...]) -> list[dict[str, Any]]:
     return lines
 
 
+def is_count(value: Any) -> bool:
+    """Return whether a value of JSON is a whole number from 0 to `MAX_INTEGER`."""
+    return type(value) is int and 0 <= value <= MAX_INTEGER
+
+
 def _is_evaluation(line: Any) -> bool:
     """Return whether a value is an object with a step, a seed, and numbers or null."""
     return (
         isinstance(line, dict)
-        and all(type(line.get(name)) is int and 0 <= line[name] <= MAX_INTEGER for name in ("step", "seed"))
+        and all(is_count(line.get(name)) for name in ("step", "seed"))
         and all(value is None or type(value) in (int, float) for value in line.values())
         and all(abs(value) <= MAX_INTEGER for value in line.values() if type(value) is int)
     )

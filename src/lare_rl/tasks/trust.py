@@ -13,8 +13,8 @@ from lare_rl.util.variables import read_variable
 __all__ = [
     "TRUST_VARIABLE",
     "check_trusted",
-    "module_to_trust",
     "trust_environment",
+    "trust_prefix",
     "trusted_modules",
     "untrusted_module",
 ]
@@ -43,10 +43,16 @@ def trusted_modules() -> list[str]:
     return [name for name in map(str.strip, read_variable(TRUST_VARIABLE).split(",")) if name]
 
 
-def module_to_trust(task: TaskSpec) -> str | None:
+def _module_to_trust(task: TaskSpec) -> str | None:
     """Return the module of a task's environment if `LARE_TRUST` must name it before a new process imports it for a report."""
     module, _ = split_environment(task.environment)
     return module if module and module not in trusted_modules() else None
+
+
+def trust_prefix(task: TaskSpec) -> str:
+    """Return what a command must begin with to import a task's environment for a run: an assignment to `LARE_TRUST`, or nothing."""
+    module = _module_to_trust(task)
+    return f"{TRUST_VARIABLE}={module} " if module else ""
 
 
 def untrusted_module(task: TaskSpec) -> str | None:
@@ -55,7 +61,7 @@ def untrusted_module(task: TaskSpec) -> str | None:
     That is a module that the user does not trust, of a task that the user has not given to this process. A module that the process
     has imported already may be used, but no unknown function of it.
     """
-    module = module_to_trust(task)
+    module = _module_to_trust(task)
     environments = _environments(task)
     if module is None or environments <= _own_environments:
         return None

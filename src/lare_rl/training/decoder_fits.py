@@ -159,7 +159,7 @@ def fit_until_converged(
     # The learner is copied, here and below, because each round consumes it.
     hidden_fields = ("current_episode", "running", "segments")
     unhidden = {name: jax.tree.map(jnp.copy, getattr(learner.replay, name)) for name in hidden_fields}
-    n_hidden = jax.vmap(partial(_count_held_out, window=config.credit_specs[0].window))(
+    n_hidden = jax.vmap(partial(_count_held_out, window=config.credit_specs[0].n_assessed))(
         replay.segments_as_episodes(learner.replay)
     )
     compute_error = jit_over_seeds(jax.vmap(partial(_held_out_error, config=config)), config.n_devices)
@@ -201,7 +201,7 @@ def _held_out_error(
 ) -> Float[Array, ""]:
     """Return the squared error of the returns of held-out episodes, summed over the teams, each in units of its returns."""
     spec = config.credit_specs[0]
-    decoders = tuple(decoder._replace(predictions=empty_predictions(1, spec.window)) for decoder in decoders)
+    decoders = tuple(decoder._replace(predictions=empty_predictions(1, spec.n_assessed)) for decoder in decoders)
     since = replay.segments_as_episodes(buffer).current_episode - n_hidden
     decoders = fold_episodes(
         decoders, buffer, since, lambda decoder, episodes, _: learning.predict(decoder, episodes, spec), config

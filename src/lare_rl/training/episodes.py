@@ -125,7 +125,7 @@ def fold_episodes(
         expected: about how many episodes there are; None if they may be many.
     """
     buffer = replay.segments_as_episodes(buffer)
-    longest, n_episodes = config.longest_segment, config.credit_specs[0].window
+    longest, n_episodes = config.longest_segment, config.credit_specs[0].n_assessed
     expected = n_episodes if expected is None else max(1, expected)
     rows = max(1, min(expected, n_episodes, MAX_ROWS // (config.n_proxy_rewards * longest))) * longest
     total = jnp.sum(count_episodes_since(buffer, since))

@@ -20,7 +20,7 @@ from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.episodes import fold_episodes
 from lare_rl.training.learner import Learner
 from lare_rl.training.saved_state import load_learner
-from lare_rl.training.seed_axis import first_shard, select_seed
+from lare_rl.training.seed_axis import first_device_seeds, select_seed
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.float64 import float64
 
@@ -76,7 +76,7 @@ def _find_explanations(run: Run, learner: Learner, config: TrainConfig) -> list[
         # The decoders of several teams read the actions of all, and a team's text describes only its own.
         has_names = not config.team_level or len(config.env.teams) == 1
         raw_names = fitted_specs[i].raw_feature_names(role.observation, role.action) if has_names else []
-        decoder = select_seed(first_shard(learner.decoders[i]))
+        decoder = select_seed(first_device_seeds(learner.decoders[i]))
         names = factor_names, raw_names, range(spec.n_levels)
         only_at_end = run.config.task.payment_rule.only_at_end
         findings.append(returns_findings(explanation, decoder, spec, *names, only_at_end=only_at_end))
@@ -93,7 +93,7 @@ def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explan
     if not _can_explain(config) or n_stored < MIN_EXPLAINED_EPISODES:
         return []
     with float64():
-        explanations = _compile(_explanation_config(config))(*first_shard((replay, _score_facts(learner))))
+        explanations = _compile(_explanation_config(config))(*first_device_seeds((replay, _score_facts(learner))))
         return jax.tree.map(np.asarray, explanations)
 
 

@@ -11,7 +11,14 @@ import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
-__all__ = ["count_seed_devices", "first_shard", "jit_over_seeds", "seed_sharding", "select_seed", "shape_over_seeds"]
+__all__ = [
+    "count_seed_devices",
+    "first_device_seeds",
+    "jit_over_seeds",
+    "seed_sharding",
+    "select_seed",
+    "shape_over_seeds",
+]
 
 AXIS = "seeds"
 
@@ -67,7 +74,7 @@ def shape_over_seeds(shape: State, n_devices: int) -> State:
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), shape)
 
 
-def first_shard(state: State) -> State:
+def first_device_seeds(state: State) -> State:
     """Return the seeds on the first device, without a copy."""
     return jax.tree.map(lambda leaf: leaf.addressable_shards[0].data, state)
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar
 from lare_rl.algorithms.batches import Metrics, Sequences
 from lare_rl.algorithms.registry import SequenceSettings
 from lare_rl.config.train_config import TrainConfig
+from lare_rl.credit.losses import is_step
 from lare_rl.data import replay
 from lare_rl.data.layouts import lay_out_padded
 from lare_rl.data.replay import Replay
@@ -180,7 +181,7 @@ def _sequences(
 ) -> Sequences:
     """Return episodes with the method's rewards. Each is padded to `n_steps` steps by copies of its last step."""
     steps = replay.read(buffer, episodes.steps(lay_out_padded(episodes.length, n_steps).step))
-    mask = (jnp.arange(n_steps) < episodes.length[:, None]) * episodes.mask[:, None]
+    mask = is_step(episodes.length, n_steps) * episodes.mask[:, None]
     reward = rewards(steps, decoders, config)
 
     def all_timesteps(name: str) -> Array:

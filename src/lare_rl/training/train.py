@@ -21,13 +21,14 @@ from lare_rl.runs.directory import Run, as_run, create_run, default_directory, e
 from lare_rl.runs.metric_names import ACTOR_SATURATION, RETURN, was_updated
 from lare_rl.runs.metrics_file import append_metrics, truncate_metrics
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.tasks.trust import trust_prefix
 from lare_rl.training import advice
 from lare_rl.training.decoder_fits import FirstFitStoppedError
 from lare_rl.training.explain import describe_returns
 from lare_rl.training.latent_functions import FunctionOrPath, choose_functions
 from lare_rl.training.process import catch_stop_signals, report_full_memory
 from lare_rl.training.progress import Listener, TensorBoard, Terminal, import_summary_writer
-from lare_rl.training.seed_axis import first_shard
+from lare_rl.training.seed_axis import first_device_seeds
 from lare_rl.training.session import Session, restore_session, start_session
 from lare_rl.util import compilation
 from lare_rl.util.findings import Finding, render
@@ -38,7 +39,7 @@ __all__ = ["RunInterruptedError", "resume", "run_session", "train"]
 EVENTS_DIRECTORY = "tensorboard"
 """The folder of TensorBoard events in a run's directory."""
 CHECKPOINT_S = 300.0
-"""Between two evaluations, a checkpoint is written after so many seconds. A crash costs about as much."""
+"""Between two evaluations, a checkpoint is written after so many seconds. A crash loses at most about this much work."""
 PROGRESS_S = 1.0
 """The least time (s) between two calls of `on_step` inside an iteration."""
 
@@ -70,8 +71,8 @@ def train(
         listeners: objects that receive the progress; the default is the terminal.
 
     Raises:
-        LareError: an argument cannot be used, or an environment or function failed. The files of the run are then still
-            complete, and `resume` continues from the last checkpoint.
+        LareError: an argument cannot be used, and no run is created; or an environment or function failed: the files of the run are
+            then complete, and `resume` continues from the last checkpoint.
     """
     if tensorboard:
         import_summary_writer()  # an error before the run directory is created
@@ -88,7 +89,7 @@ def train(
     messages = unused[:1] if len(unused) < 2 else [f"{unused[0]} (and {len(unused) - 1} more)"]
     messages += _describe_rounding(resolved, steps=settings.steps, evaluate_every=settings.evaluate_every)
     with lock_run(run), report_full_memory(run), catch_stop_signals() as stop:
-        return _finish(run, tensorboard, listeners, stop, messages, resolved.steps)
+        return _run_to_end(run, tensorboard, listeners, stop, messages, resolved.steps)
 
 
 def resume(
@@ -122,12 +123,12 @@ def resume(
         earlier_steps = run.config.settings.steps
         run = run if steps is None else extend_run(run, steps)
         messages = _describe_rounding(run.config.settings, steps=steps)
-        return _finish(run, tensorboard, listeners, stop, messages, earlier_steps)
+        return _run_to_end(run, tensorboard, listeners, stop, messages, earlier_steps)
 
 
 def _describe_rounding(resolved: ResolvedSettings, **requested: int | None) -> list[str]:
     """Return a message about each number of steps that was rounded up to whole iterations."""
-    iteration = f"an iteration has {resolved.iteration_steps:,} steps (rollout_steps)"
+    iteration = f"an iteration has {resolved.iteration_steps:,} steps (environments x rollout_steps)"
     return [
         f"{name} = {steps:,} is rounded up to {rounded:,}: {iteration}"
         for name, steps in requested.items()
@@ -149,7 +150,7 @@ def _check_listeners(listeners: Sequence[Listener] | None) -> list[Listener]:
     return checked
 
 
-def _finish(
+def _run_to_end(
     run: Run,
     tensorboard: bool,
     listeners: Sequence[Listener],
@@ -159,7 +160,7 @@ def _finish(
 ) -> Run:
     """Run to the end, from the last checkpoint if there is one. Every listener that was started is stopped, also after an error.
 
-    `messages` are sent to the listeners first. A run that is extended had `earlier_steps` before.
+    `messages` are sent to the listeners before training starts. A run that is extended had `earlier_steps` before.
     """
     for listener in listeners:
         listener.on_message(
@@ -195,7 +196,7 @@ def _introduction(session: Session, earlier_steps: int) -> list[str]:
         messages.append(
             f"{settings.algorithm}.anneal: the learning rate had fallen to {max(0, 1 - step / earlier_steps):.0%} of its initial value, "
             f"and falls again from {1 - step / settings.steps:.0%}, so the result is not that of one long run; a run that began with "
-            f"--{settings.algorithm}.no-anneal can be extended"
+            f"--{settings.algorithm}.no-anneal can be extended without this difference"
         )
     if (warning := warmup_warning(settings)) is not None:
         messages.append(warning)
@@ -239,7 +240,7 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
         for listener in listeners:
             listener.on_step(session.step)
         if before <= settings.warmup < session.step:
-            report(advice.find_large_observations(run, first_shard(session.learner.replay), session.config))
+            report(advice.find_large_observations(run, first_device_seeds(session.learner.replay), session.config))
         is_last = session.step == settings.steps
         if not is_last and session.step % settings.evaluate_every:
             if time.monotonic() - saved_at > CHECKPOINT_S:
@@ -274,7 +275,8 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
 def _advance(session: Session, stop: threading.Event) -> None:
     """Advance a session, at most to its next evaluation. Raise `RunInterruptedError` if `stop` is set."""
     step, settings = session.step, session.settings
-    hint = f"to continue: lare-rl train --resume {shlex.quote(str(session.run.directory))}"
+    run = session.run
+    hint = f"to continue: {trust_prefix(run.config.task)}lare-rl train --resume {shlex.quote(str(run.directory))}"
     if stop.is_set():
         session.save()
         session.finish_saving()
@@ -303,6 +305,6 @@ def _final_findings(run: Run, lines: Sequence[dict[str, Any]]) -> list[Finding]:
     if ACTOR_SATURATION in lines[0]:
         findings = advice.find_saturated_policies([line[ACTOR_SATURATION] for line in lines], run.seeds) + findings
     untrained = advice.find_untrained(run)
-    if untrained is not None and untrained.code != "all steps random":  # that was the first message
+    if untrained is not None and untrained.code != "all steps random":  # `_introduction` has said so
         findings.append(untrained)
     return findings

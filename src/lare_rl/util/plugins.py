@@ -25,6 +25,7 @@ __all__ = ["Registry", "load_plugins"]
 T = TypeVar("T")
 
 _NAME = re.compile(r"[\w.-]+")
+_SHOW_LINE = "lare-rl --debug shows the line."
 
 
 @cache
@@ -33,21 +34,28 @@ def load_plugins() -> None:
     for entry in entry_points(group="lare_rl.plugins"):
         package = entry.dist.name if entry.dist else "its package"
         plugin = f"{entry.name!r} of the package {package} (entry point {entry.name} = {entry.value})"
-        _import_plugin(entry.value.partition(":")[0].strip(), plugin, f"Update or uninstall {package}.")
+        module = re.split(r"[:[]", entry.value)[0].strip()  # MODULE, MODULE:NAME or MODULE [EXTRAS]
+        advice = f"Update or uninstall {package}."
+        _import_plugin(module, plugin, advice, advice)
     for module in filter(None, map(str.strip, read_variable("LARE_PLUGINS").split(","))):
-        without = f", and write {module[:-3]}" if module.endswith(".py") else ""
-        advice = f"Correct LARE_PLUGINS, or PYTHONPATH, where Python looks for it{without}."
-        _import_plugin(module, repr(module), advice)
+        advice = "Correct LARE_PLUGINS (names of modules, without .py), or add the module's folder to PYTHONPATH."
+        if not all(map(str.isidentifier, module.split("."))):
+            raise LareError(f"the plugin {module!r} is no name of a module. {advice}")
+        _import_plugin(module, repr(module), advice, _SHOW_LINE)
 
 
-def _import_plugin(module: str, plugin: str, advice: str) -> None:
-    """Import a plugin. `plugin` describes it in the error, and `advice` says what to do if its module is missing."""
+def _import_plugin(module: str, plugin: str, missing_advice: str, import_advice: str) -> None:
+    """Import a plugin, which `plugin` describes in the error.
+
+    `missing_advice` says what to do if there is no such module, and `import_advice` if the module imports what does not exist.
+    """
     try:
         import_module(module)
     except Exception as error:  # a plugin's code can raise anything
         reason = one_line(f"{type(error).__name__}: {error}")
-        if not isinstance(error, ImportError):
-            advice = "lare-rl --debug shows the line."
+        name = error.name if isinstance(error, ModuleNotFoundError) else None
+        is_missing = name is not None and f"{module}.".startswith(f"{name}.")
+        advice = missing_advice if is_missing else import_advice if isinstance(error, ImportError) else _SHOW_LINE
         raise LareError(f"the plugin {plugin} cannot be imported: {reason}. {advice}") from error
 
 
@@ -69,8 +77,8 @@ class Registry(Mapping[str, T], Generic[T]):
             raise LareError(f"the name of a {self._kind} has letters, digits, -, _ and . only, unlike {name!r}")
         if self._values.setdefault(name, value) != value:
             raise LareError(
-                f"there is another {self._kind} {name!r}: choose another name; if you ran the same file or cell twice, restart Python, "
-                "and start training from another file than the plugin"
+                f"there is another {self._kind} {name!r}: choose another name; if you ran the same cell twice, restart Python; if the "
+                "plugin's own file starts the training, start it from another file"
             )
 
     def find(self, name: str) -> T:
@@ -80,8 +88,8 @@ class Registry(Mapping[str, T], Generic[T]):
         try:
             return find_named(self._kind, self._kinds, name, self._values)
         except LareError as error:
-            plugin = "" if read_variable("LARE_PLUGINS") else " (of a plugin: name its module in LARE_PLUGINS)"
-            raise LareError(f"{error}{plugin}") from None
+            hint = f"; for a {self._kind} of a plugin, name the plugin's module in LARE_PLUGINS"
+            raise LareError(f"{error}{'' if read_variable('LARE_PLUGINS') else hint}") from None
 
     def __getitem__(self, name: str) -> T:
         if name not in self._values:

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Scalar
 from lare_rl.algorithms.batches import Metrics, Sequences
 from lare_rl.algorithms.qmix import QMIXSettings
 from lare_rl.algorithms.qmix.networks import Mixer, RecurrentNetwork, mix
-from lare_rl.nn.masks import masked_mean
+from lare_rl.nn.masks import masked_mean, select
 from lare_rl.nn.networks import adam_step, clip_gradient, copy_networks, init_adam
 
 __all__ = ["QMIX", "Memory", "act", "epsilon", "get_actor", "init", "init_memory", "update"]
@@ -168,5 +168,5 @@ def update(
     online, optimizer = adam_step(state.online, gradient, state.optimizer, settings.learning_rate)
 
     # Not a `cond`: seeds are batched by `vmap`, and each seed copies at its own time.
-    target = jax.tree.map(lambda old, new: jnp.where(copy_target, new, old), state.target, online)
+    target = select(copy_target, online, state.target)
     return QMIX(online, target, optimizer), {"critic/loss": td_loss, "critic/value": mean_target}
