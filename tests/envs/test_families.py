@@ -1,5 +1,6 @@
 """From a task to its environment: families, the keys that they read, and what must agree."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from helpers.host_envs import ToyHostEnv
 from helpers.toy_envs import toy_spec
-from lare_rl.envs.families import make_env, register_family
+from lare_rl.envs.families import FAMILIES, make_env, picklable_maker, register_family
 from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
@@ -178,3 +179,11 @@ def test_spec_is_checked(changes, message):
     register_family(name, Unbounded)
     with pytest.raises(LareError, match=message):
         make_env(toy_spec(environment=f"{name}/two", observation_size=2, action_size=2))
+
+
+def test_a_worker_registers_a_family_that_its_maker_module_does_not(monkeypatch):
+    pickled = pickle.dumps(picklable_maker(make_task(environment="logged/two", action_size=2)))
+    monkeypatch.delitem(FAMILIES._values, "logged")
+    env = pickle.loads(pickled)()
+    assert isinstance(env, Logged)
+    assert "logged" in FAMILIES
