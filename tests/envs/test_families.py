@@ -182,7 +182,7 @@ def test_spec_is_checked(changes, message):
 
 
 def test_a_worker_registers_a_family_that_its_maker_module_does_not(monkeypatch):
-    pickled = pickle.dumps(picklable_maker(make_task(environment="logged/two", action_size=2)))
+    pickled = pickle.dumps(picklable_maker(make_task(environment="logged/two", observation_size=2, action_size=2)))
     monkeypatch.delitem(FAMILIES._values, "logged")
     env = pickle.loads(pickled)()
     assert isinstance(env, Logged)
