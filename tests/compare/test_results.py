@@ -59,7 +59,7 @@ def test_other_tasks_and_steps(write_csv, run):
     results, findings = collect_results((run.directory, path))
     assert [(finding.code, finding.values.get("task"), finding.values.get("step")) for finding in findings] == [
         ("other_task", "Depot", None),
-        ("other_steps", None, 100),
+        ("other_steps", "Chase", 100),
     ]
     (group, _) = compare(results).groups.values()
     assert (group.task, group.steps) == ("Chase", (50,))

@@ -58,7 +58,7 @@ def test_a_second_simulation_is_tried(name, separate, monkeypatch):
     if name == "Slow":
         monkeypatch.setattr(placement, "SLOW_STEP_S", 0.002)
     if name == "Hangs":
-        monkeypatch.setattr(placement, "SECOND_TIMEOUT_S", 1.5)
+        monkeypatch.setattr(placement, "INTERFERENCE_TIMEOUT_S", 1.5)
     task = single_spec(name)
     assert needs_process(task) == separate
     assert not simulations
@@ -75,7 +75,7 @@ def test_a_second_simulation_is_tried(name, separate, monkeypatch):
 
 
 def test_familiar_packages_and_scripts_share_a_process(monkeypatch):
-    monkeypatch.setattr(placement, "_try_second", lambda task: pytest.fail("tried"))
+    monkeypatch.setattr(placement, "_fails_trial", lambda task: pytest.fail("tried"))
     pendulum = toy_spec(name="p", environment="Pendulum-v1", observation_size=3)
     spread = toy_spec(
         name="s", environment="pettingzoo/mpe2.simple_spread_v3:parallel_env", observation_size=18, action_size=5

@@ -42,7 +42,7 @@ def parse(changes, layout=LAYOUT):
         ({"group": np.array([None, 1], object)}, "group must be a text or a number"),
         ({"terminations": np.zeros(2, bool)}, "terminations must have one flag for each of 3 steps"),
         ({"truncations": np.full(3, 2)}, "truncations must be true or false"),
-        ({"terminations": np.array([0, 1, 0])}, "terminations ends the episode at step 1 of 3"),
+        ({"terminations": np.array([0, 1, 0])}, "terminations ends the episode at step 2 of 3"),
     ],
 )
 def test_parse_bad_episode(changes, message):

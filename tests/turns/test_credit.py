@@ -44,7 +44,7 @@ def test_signed_and_small_numbers(size):
         rollouts.append({"turns": turns, "outcome": float(delta.sum() + random.normal() > 0), "group": k // 6})
     result = lare_rl.TurnCredit()(rollouts)
     (effect,) = result.effects
-    assert effect.unit == pytest.approx(size)
+    assert effect.feature_size == pytest.approx(size)
     assert effect.first > 0.05
     assert result.gain > 0.1
 

@@ -17,12 +17,12 @@ __all__ = ["collect_results", "select_runs"]
 def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[LearningCurve], list[Finding]]:
     """Read the results in run directories and tables (.csv), and find what the user should know about them.
 
-    The first label is the baseline: that of the first path or, of a single directory, `episodic`, if that was trained. The other
-    methods of tables come after all runs.
+    The first label is the baseline. If the first path is a table, it is that table's first label that is kept; else, with one directory,
+    `episodic`, if it was trained; else that of the first run. All other labels of tables come after those of runs.
 
     Raises `LareError` if a path has nothing to compare, or a file is damaged.
     """
-    tables = [path for path in paths if path.suffix == ".csv"]
+    tables = [path for path in paths if path.suffix.lower() == ".csv"]
     directories = [path for path in paths if path not in tables]
     runs, findings = [], []
     if directories or not tables:
@@ -46,7 +46,7 @@ def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[L
 
 
 def select_runs(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], list[Finding]]:
-    """Select the runs that have a metric, and find runs that were not trained to their end.
+    """Select the runs that have a metric. Report those left out, unfinished or never updated, and that returns are means over agents.
 
     Raises `LareError` if no run has an evaluation, or none has a value of the metric.
     """
@@ -90,14 +90,14 @@ def _find_other_steps(
     run_results: Sequence[LearningCurve], table_results: Sequence[LearningCurve], metric: str
 ) -> list[Finding]:
     """Report the methods of tables that lack the last step that all runs have."""
-    curves = group_pairs((result.task, set(result.values)) for result in run_results if result.values)
-    last_steps = {task: max(set.intersection(*steps), default=None) for task, steps in curves.items()}
+    steps_by_task = group_pairs((result.task, set(result.values)) for result in run_results if result.values)
+    last_steps = {task: max(set.intersection(*steps), default=None) for task, steps in steps_by_task.items()}
     missing = dict.fromkeys(
-        (result.source, result.label, step)
+        (result.source, result.label, result.task, step)
         for result in table_results
         if (step := last_steps[result.task]) is not None and step not in result.values
     )
     return [
-        Finding("other_steps", {"source": source, "metric": metric, "label": label, "step": step})
-        for source, label, step in missing
+        Finding("other_steps", {"source": source, "metric": metric, "label": label, "task": task, "step": step})
+        for source, label, task, step in missing
     ]

@@ -20,7 +20,7 @@ MESSAGES = {
     "untrained": "{run}: {reason}",
     "mean_over_agents": "Returns are means over the agents. --metric {metric} compares their sums.",
     "other_task": "The rows of {source} on {task} are left out: the runs are on {tasks}.",
-    "other_steps": "{source} lacks {metric} of {label} at step {step:,} for some seeds: no run of this task is compared there.",
+    "other_steps": "{source} lacks {metric} of {label} on {task} at step {step:,} for some seeds: no run of {task} is compared there.",
     "differ": "The runs differ in {differences}.",
     "origin": "All runs: {facts}.",
     # Scores.

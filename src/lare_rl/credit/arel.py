@@ -3,11 +3,11 @@
 Attention over the steps of each agent alternates with attention over the agents of each step. The sum over the agents then
 gives one reward for each step, which all agents receive:
 
-    r_hat_{i,t} = y_t = w . sum_i h_{i,t},    penalty = 20 / T^2 E Var_t(y)
+    r_hat_{i,t} = y_t = sqrt(T) (w . sum_j h_{j,t}),    penalty = 20 / T^2 E Var_t(y)
 
 The published penalty is 20 E Var_t(y), added to the squared error of the sum of T rewards. Here it is added to the squared
-error of their mean, hence 1 / T^2. y is multiplied by sqrt(T), as the outputs of other decoders are by sqrt(nT): see
-`CreditSpec.output_scale`.
+error of their mean, hence 1 / T^2. h are the tokens after all layers, and w includes a bias. The factor is sqrt(T), not the sqrt(nT) of
+other decoders (`CreditSpec.output_scale`), because a step has one reward for all agents.
 """
 
 import math

@@ -44,7 +44,7 @@ __all__ = [
 MIN_BINARY_RETURNS = 16
 """With fewer returns, nothing is said about whether they look as if won or lost."""
 MIN_GROWTH = 0.02
-"""A decoder learns from new episodes when their number exceeds this fraction of the number of old ones. Short episodes thus come in
+"""A decoder learns from new episodes when their number reaches this fraction of the number of old ones. Short episodes thus come in
 batches."""
 
 

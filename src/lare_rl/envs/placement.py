@@ -1,8 +1,8 @@
-"""The process in which an environment runs: this one, or its own, which is watched and waits for the next environment of the task.
+"""Where an environment runs: in this process, or in its own worker process, which is killed if it hangs, and after `close` serves the
+task's next environment.
 
 Some simulators, such as libsumo, allow a single simulation in a process, and a run needs two environments at least: for training
-and for evaluations. A task says so by `processes = "separate"`. With "auto", two environments of a package that LaRe does not know
-are tried in a worker process.
+and for evaluations. See `TaskSpec.processes`.
 """
 
 import contextlib
@@ -20,6 +20,7 @@ from lare_rl.envs.families import GYMNASIUM, find_family, make_env, make_local_e
 from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
 from lare_rl.envs.trials import time_steps
 from lare_rl.envs.vec_env import LocalVecEnv, VecEnv, first_timestep
+from lare_rl.envs.worker_process import WorkerTimeoutError
 from lare_rl.envs.workers import SubprocVecEnv
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec, split_environment
@@ -28,20 +29,21 @@ from lare_rl.util.processes import n_usable_cores
 __all__ = [
     "SLOW_STEP_S",
     "SeparateEnv",
+    "is_known_separate",
     "load_env_spec",
     "make_host_env",
     "make_vec_env",
     "measure_step_s",
     "n_open_envs",
     "needs_process",
-    "runs_separately",
 ]
 
 SLOW_STEP_S = 2e-3
 """If a step of an unknown package's environment takes longer, each gets its own process. A call of a worker takes a tenth of this."""
 SLOW_START_S = 2.0
-"""If an unknown package's environment takes longer to make, each gets its own process: a trial of a second would take as long again."""
-SECOND_TIMEOUT_S = 30.0
+"""If an unknown package's environment takes longer to make, each gets its own process, because trying a second environment would
+take as long again."""
+INTERFERENCE_TIMEOUT_S = 30.0
 """If a second environment in the process does not reply for longer, each gets its own process."""
 
 MIN_SAVED_S = 3e-4
@@ -82,9 +84,9 @@ class SeparateEnv:
 def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
     """Make a task's environment as a `HostEnv`, even if it is a `JaxEnv`. See `make_env`.
 
-    It is in its own process if `runs_separately`, but not with `kwargs`, because a worker draws no films.
+    It is in its own process if `is_known_separate`, but not with `kwargs`, because a worker draws no films.
     """
-    return SeparateEnv(task) if runs_separately(task) and not kwargs else make_local_env(task, **kwargs)
+    return SeparateEnv(task) if is_known_separate(task) and not kwargs else make_local_env(task, **kwargs)
 
 
 @lru_cache(maxsize=64)
@@ -99,8 +101,8 @@ def load_env_spec(task: TaskSpec) -> EnvSpec:
 def make_vec_env(task: TaskSpec, n: int, parallel: bool = False) -> VecEnv:
     """Make `n` environments of a task: each in its own process if it needs that, else where they step fastest.
 
-    Environments that workers cannot make, such as those that the user's script registers, stay in this process. If `parallel`, all
-    are in worker processes in any case.
+    Environments that workers cannot make, such as those that the user's script registers, stay in this process. If `parallel`, worker
+    processes are used even if they are not faster, and `LareError` is raised if they cannot make the environments.
     """
     if needs_process(task):
         return _make_separate(task, n)
@@ -119,7 +121,7 @@ def n_open_envs(task: TaskSpec, n_seeds: int, n_episodes: int) -> int:
     return min(n_episodes, max(1, n_usable_cores() // n_seeds)) if needs_process(task) else n_episodes
 
 
-def runs_separately(task: TaskSpec) -> bool:
+def is_known_separate(task: TaskSpec) -> bool:
     """Return whether each environment of a task needs its own process, by its file or an earlier trial."""
     return task.processes == "separate" or _separate_tasks.get(task, False)
 
@@ -130,14 +132,17 @@ def needs_process(task: TaskSpec) -> bool:
         return True
     if task not in _separate_tasks:
         package = None if load_env_spec(task).is_jax else _find_package(task)
-        _separate_tasks[task] = package not in (None, *_FAMILIAR_PACKAGES) and _try_second(task)
+        _separate_tasks[task] = package not in (None, *_FAMILIAR_PACKAGES) and _fails_trial(task)
     return _separate_tasks[task]
 
 
-def _try_second(task: TaskSpec) -> bool:
+def _fails_trial(task: TaskSpec) -> bool:
     """Try environments in a worker process. Return whether they are slow, or cannot share a process."""
     try:
         env = SeparateEnv(task)
+    except WorkerTimeoutError as error:
+        _log.info("%s: %s", task.environment, error)
+        return True
     except LareError:  # a worker cannot make it, because the user's script registers it
         return False
     try:
@@ -145,7 +150,7 @@ def _try_second(task: TaskSpec) -> bool:
         if step_s > SLOW_STEP_S or env.envs.make_s > SLOW_START_S:
             problem = f"a step takes {1000 * step_s:.2g} ms, a start {env.envs.make_s:.2g} s"
         else:
-            problem = env.envs.find_interference(picklable_maker(task), SECOND_TIMEOUT_S)
+            problem = env.envs.find_interference(picklable_maker(task), INTERFERENCE_TIMEOUT_S)
     except LareError as error:
         problem = str(error)
     env.close()

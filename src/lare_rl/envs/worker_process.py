@@ -38,6 +38,10 @@ CLOSE_TIMEOUT_S = 2.0
 """Workers must close their environments within this time."""
 
 
+class WorkerTimeoutError(LareError):
+    """A worker did not reply in time."""
+
+
 class Worker:
     """A worker process and its environments, from the parent's side."""
 
@@ -83,7 +87,7 @@ class Worker:
                 if self.process.poll() is not None:
                     raise self._make_death_error() from None
                 if time.monotonic() > deadline:
-                    raise LareError(f"{self.label} did not start within {CONNECT_TIMEOUT_S:g} s") from None
+                    raise WorkerTimeoutError(f"{self.label} did not start within {CONNECT_TIMEOUT_S:g} s") from None
                 time.sleep(CONNECT_POLL_S)
 
     @property

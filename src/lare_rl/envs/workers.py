@@ -18,7 +18,7 @@ from jaxtyping import Bool, Shaped
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.envs.shared_arrays import map_arrays, open_shared_memory
 from lare_rl.envs.vec_env import Maker, VecEnv, check_same_sizes
-from lare_rl.envs.worker_process import Worker, end_workers, pickle_maker
+from lare_rl.envs.worker_process import Worker, WorkerTimeoutError, end_workers, pickle_maker
 from lare_rl.errors import LareError
 from lare_rl.util.processes import n_usable_cores
 
@@ -159,7 +159,7 @@ class SubprocVecEnv(VecEnv):
                         advice = "; the run was asked to stop, and cannot be saved"
                     elif command == "a second environment":
                         advice = ""
-                    raise LareError(f"{worker.label} did not reply for {seconds:.1f} s in {command}{advice}")
+                    raise WorkerTimeoutError(f"{worker.label} did not reply for {seconds:.1f} s in {command}{advice}")
         return replies
 
     def _latest_reply(self, worker: Worker, stopped_at: float) -> float:

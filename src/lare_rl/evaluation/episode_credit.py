@@ -19,7 +19,7 @@ from lare_rl.data.sampling import get_episodes
 from lare_rl.envs.interface import team_mean
 from lare_rl.runs.directory import Run
 from lare_rl.training.decoder_inputs import alive_agents, decoder_inputs
-from lare_rl.training.episodes import predict_returns
+from lare_rl.training.episodes import store_predicted_returns
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import has_step_rewards, rewards
 from lare_rl.training.saved_state import load_learner
@@ -83,7 +83,7 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
             segments = replay.segments_as_episodes(learner.replay)
             since = segments.current_episode.at[0].set(replay.look_up(segments.episode, index.env[0], index.number[0]))
             with float64():
-                learner = predict_returns(learner, since, config)
+                learner = store_predicted_returns(learner, since, config)
         steps = replay.read(learner.replay, index)
         return steps, rewards(steps, learner.decoders, replace(config, scale_rewards=False))
 

@@ -20,7 +20,7 @@ from lare_rl.runs.directory import Run
 from lare_rl.tasks.payments import is_paid
 from lare_rl.training.collect_device import make_jax_env, unroll_on_device
 from lare_rl.training.decoder_inputs import compute_host_factors
-from lare_rl.training.episodes import predict_returns
+from lare_rl.training.episodes import store_predicted_returns
 from lare_rl.training.evaluation import EpisodeBatch
 from lare_rl.training.learner import Learner, empty_replay, store_with_factors
 from lare_rl.training.rewards import has_step_rewards, rewards
@@ -151,7 +151,7 @@ def compute_proxy_rewards(
         filled = store_with_factors(learner._replace(replay=buffer), steps, factors, config)
         if config.is_exact:
             since = replay.segments_as_episodes(filled.replay).oldest
-            filled = predict_returns(filled._replace(decoders=learner.decoders), since, config)
+            filled = store_predicted_returns(filled._replace(decoders=learner.decoders), since, config)
         stored = replay.read_newest(filled.replay, n_steps)
         return jnp.swapaxes(rewards(stored, learner.decoders, replace(config, scale_rewards=False)), 0, 1)
 

@@ -44,7 +44,8 @@ def policy_graph(actor: Any, config: TrainConfig) -> Graph:
         if memory := policy.init_memory(config):
             inputs["hidden"] = graph_input("hidden", (*agents, memory.hidden.shape[-1]))
             inputs["last_action"] = graph_input("last_action", agents, "int")
-        return finish(**add_function(partial(_act, actor=actor, config=config), inputs))
+        hint = ": load the policy in Python with lare_rl.load_policy"
+        return finish(**add_function(partial(_act, actor=actor, config=config), inputs, hint))
 
 
 def _act(inputs: dict[str, Array], actor: Any, config: TrainConfig) -> dict[str, Array]:

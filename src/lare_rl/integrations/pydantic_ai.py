@@ -56,7 +56,10 @@ def pydantic_ai_model(model: Any) -> FunctionModel:
 
 @cache
 def _event_loop() -> asyncio.AbstractEventLoop:
-    """Return the loop of all requests, because connections belong to a loop. In a notebook, the main thread runs another."""
+    """Return the one loop of all requests: a connection works only in the loop that opened it.
+
+    It has its own thread, because in a notebook the main thread already runs a loop.
+    """
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, daemon=True).start()
     return loop

@@ -8,6 +8,7 @@ from lare_rl.logs.open_log import open_log
 from lare_rl.new_task.documentation import single_agent_lines, split_sections, unused_titles, write_texts
 from lare_rl.new_task.draft import (
     ACTION,
+    DEFAULT_LIMIT,
     SCORE_LINE,
     STATE,
     Draft,
@@ -23,11 +24,12 @@ from lare_rl.tasks.spec import NO_ENVIRONMENT
 __all__ = ["draft_log_task"]
 
 ENVIRONMENT_LINE = (
-    '# environment: "none", because there are only logs. To train, write the id of the environment that they come from.'
+    f'# environment: "{NO_ENVIRONMENT}", because there are only logs. To train, write the id of the environment that they come '
+    "from."
 )
 LOG_LIMIT_LINE = (
-    "# max_episode_steps = 1000 # the time limit, if there is one. If the log has flags, shorter episodes that did not terminate then "
-    "count as cut, and nothing is learned from them"
+    f"# max_episode_steps = {DEFAULT_LIMIT} # the time limit, if there is one. If it is set and the log has flags, an episode that is "
+    "shorter and did not terminate counts as cut, and nothing is learned from it"
 )
 
 

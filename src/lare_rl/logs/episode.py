@@ -76,7 +76,8 @@ def infer_layout(name: str, values: Mapping[str, Any], role: TaskSpec | None) ->
     layouts = {}
     for kind in ("observation", "action"):
         array = to_array(values.get(f"{kind}s", np.zeros((0, 0))), f"{name}: {kind}s")
-        is_column = kind == "action" and array.ndim == 2 and array.shape[1] == 1  # as replay buffers store choices
+        # As replay buffers store choices. Without a task, an observation of one whole number is a number.
+        is_column = array.ndim == 2 and array.shape[1] == 1 and (kind == "action" or sizes.get(kind, 1) != 1)
         is_discrete = array.dtype.kind in "iu" and (array.ndim == 1 or is_column)
         if is_discrete and kind not in sizes:
             raise LareError(
@@ -103,8 +104,8 @@ def parse_episode(name: str, values: Mapping[str, Any], layout: LogLayout, conte
     Args:
         name: name of the file, or of the episode in it.
         values: `observations` (T + 1, ...) or, with `next_observations` (T, ...), (T, ...); `actions` (T, ...); `rewards` (T,) or
-            `score`, a single number. Optional: `terminations` and `truncations`, (T,) or one flag; `cut`, one flag; `paid` (T,),
-            the rewards before the log was relabelled; `group`, a text or a number.
+            `score`, a single number. Optional: `terminations`, `truncations` and `cut`, (T,) or one flag; `paid` (T,), the
+            rewards before the log was relabelled; `group`, a text or a number, or (T,) of them.
         contents: what to write again, with new rewards.
 
     Raises:
@@ -205,5 +206,5 @@ def _last_flag(name: str, key: str, values: Mapping[str, Any], n_steps: int) -> 
     if key == "cut":
         return bool(flags.any())
     if flags[:-1].any():
-        raise LareError(f"{name}: {key} ends the episode at step {int(flags.argmax())} of {n_steps}")
+        raise LareError(f"{name}: {key} ends the episode at step {int(flags.argmax()) + 1} of {n_steps}")
     return bool(flags[-1])

@@ -19,13 +19,13 @@ __all__ = ["Log", "atomic_output", "batch_by_steps", "check_output", "list_files
 _Item = TypeVar("_Item")
 
 BATCH_STEPS = 8192
-"""The least number of steps whose rewards are computed, or which are written, at a time."""
+"""Steps at a time: at least this many are computed or written, and at most this many rows of steps are read."""
 LOG_SUFFIXES = frozenset({".npz", ".parquet", ".arrow", ".json"})
 """Files of logs. A directory with other files is never replaced."""
 
 
 class Log(ABC):
-    """A log, which is read as a stream, more than once. It is never in memory as a whole, except for a log of arrays."""
+    """A log, which is read as a stream, more than once. It is never in memory as a whole, unless its source is in memory."""
 
     name: str
     """The path or the id, for messages."""
@@ -37,7 +37,7 @@ class Log(ABC):
 
     @abstractmethod
     def read(self) -> Iterator[tuple[str, Mapping[str, Any], Any]]:
-        """Yield the name, the arrays and the contents (see `parse_episode`) of each episode, in order."""
+        """Yield the name, the arrays and the contents (all that was read, for `write`) of each episode, in order."""
 
     @abstractmethod
     def write(
@@ -86,7 +86,8 @@ def batch_by_steps(items: Iterable[_Item], count_steps: Callable[[_Item], int]) 
 def check_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> None:
     """Raise `LareError` if `out` exists and must not be replaced, or if nothing can be written there.
 
-    `folders` are the names of the directories that a log has. A directory with others is never replaced.
+    `folders` are the names of the directories that may be in `out` (only Minari's format has one). If `out` has any other, it is never
+    replaced.
     """
     with report_write_error(out):
         if out.exists() and not overwrite:
@@ -97,7 +98,11 @@ def check_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> No
                 raise LareError(
                     f"{out} cannot be replaced, because {path.name} in it is not a log: choose another path"
                 )
-        if not out.name or not out.parent.is_dir():
+        if not out.name:
+            raise LareError(f"{out} cannot be replaced: give the name of the directory")
+        if out.exists() and not (out.is_file() or out.is_dir()):
+            raise LareError(f"{out} is a device or a pipe, which is never replaced: choose another path")
+        if not out.parent.is_dir():
             raise LareError(f"{out} cannot be written: there is no directory {out.parent}")
         check_writable(out)
 
@@ -120,7 +125,9 @@ def atomic_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> I
         with report_write_error(out, "; existing data are unchanged"):
             yield new
             check_output(out, overwrite, folders)
-            if out.is_dir() or (out.exists() and new.is_dir()):  # which nothing replaces at once
+            if out.is_dir() or (
+                out.exists() and new.is_dir()
+            ):  # no single call replaces a directory, or a file by a directory
                 out.rename(old)
             new.replace(out)
     finally:
@@ -133,7 +140,7 @@ def atomic_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> I
 def _clean_up(out: Path) -> None:
     """Put back the data that a killed process had moved away, and remove what it had written so far."""
     with contextlib.suppress(OSError):
-        for path in out.parent.glob(f".{glob.escape(out.name)}.{'[0-9a-f]' * 32}.*"):  # not of a longer name than `out`
+        for path in out.parent.glob(f".{glob.escape(out.name)}.{'[0-9a-f]' * 32}.*"):  # not those of `OUT.b`
             if path.suffix == ".old" and not out.exists():
                 path.rename(out)
             elif path.suffix in (".old", ".new"):

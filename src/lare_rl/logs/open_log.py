@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lare_rl.errors import LareError, short_repr
-from lare_rl.logs.log import Log
+from lare_rl.logs.log import Log, list_files
 from lare_rl.tasks.spec import TaskSpec, require_role
 
 __all__ = ["open_log"]
@@ -50,7 +50,7 @@ def _open_path(source: str | Path, role: TaskSpec | None) -> Log:
         raise LareError(
             f"{path} is not a log: give a Parquet file, or a directory with an .npz file for each episode (docs/reference/logs.md)"
         )
-    if path.is_file() or any(path.glob("*.parquet")):
+    if path.is_file() or list_files(path, ".parquet"):
         from lare_rl.logs.tables import ParquetLog
 
         return ParquetLog(path, role)

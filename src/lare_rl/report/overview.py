@@ -56,7 +56,7 @@ def summarise_runs(
 ) -> list[RunSummary | None]:
     """Return the summary of each run of a task, with the returns of its first team.
 
-    A run is compared with the best of those on the return of the episode alone, which are not compared themselves.
+    Each run is compared with the best episodic run. Episodic runs are compared with none.
     """
     episodic = None
     episodic_runs = [run for run in runs if run.is_episodic and np.isfinite(run.final_return)]
@@ -97,7 +97,7 @@ def _tiles(reported: ReportedRun, summary: RunSummary) -> Iterable[tuple[str, st
         if number:
             yield title, number, f"{std and f'± {std}, '}{format_for_reader(len(values), f'count {noun}')}"
     if summary.return_r2 is not None:
-        yield "R² of returns", format_for_reader(summary.return_r2, "r2"), "of new episodes; 1 is perfect"
+        yield WORDS["r2"][0], format_for_reader(summary.return_r2, "r2"), "of new episodes; 1 is perfect"
     if (seconds := reported.training_seconds()) is not None:
         yield "Time trained", format_for_reader(seconds, "seconds"), f"{int(summary.steps[-1]):,} steps for each seed"
 
@@ -124,14 +124,14 @@ def render_final_values(runs: Sequence[ReportedRun]) -> str:
     """Return a table of the last values of runs of a task: a row for each run or, of a single run, for each seed."""
     rows = []
     for reported in runs:
-        values = [reported.final_values(metric) for metric in _METRICS]
         step, n_seeds = f"{reported.last_step:,}", len(reported.run.seeds)
         if len(runs) > 1:
+            values = [reported.final_values(metric) for metric in _METRICS]
             rows.append((reported.name, *map(_format_spread, values), str(n_seeds), step))
         else:
+            columns = [reported.values(metric)[:, -1:] for metric in _METRICS]
             for i, seed in enumerate(reported.run.seeds):
-                cells = (format_number(numbers[i]) if len(numbers) == n_seeds else "" for numbers in values)
-                rows.append((f"seed {seed}", *cells, "", step))
+                rows.append((f"seed {seed}", *(_format_spread(finite(column[i])) for column in columns), "", step))
     header = ("run", *_METRICS.values(), "seeds", "steps")
     return render_table(header, rows, numbers=range(1, len(header)))
 
@@ -165,7 +165,7 @@ def render_learning_curves(
 def _other_metrics(task: TaskSpec) -> Iterable[_Metric]:
     measures = [_Metric(f"evaluation/{name}", name.replace("_", " ").capitalize()) for name in task.measures]
     metrics = [
-        _Metric(RETURN_R2, "R² of returns", (0.0, 1.0)),
+        _Metric(RETURN_R2, WORDS["r2"][0], (0.0, 1.0)),
         _Metric(CREDIT_CORRELATION, "Correlation of proxy and true rewards", (0.0, 1.0)),
         _Metric(CREDIT_ERROR, "Credit error: mean |proxy - true reward|"),
     ]
@@ -195,7 +195,7 @@ def _draw_metric(
     curves = {reported.name: curve for reported in runs if (curve := reported.curve(metric.name))}
     if not curves:
         return ""
-    lines, n_coloured = [], sum(colours[name] != "grey" for name in curves)
+    lines, n_coloured = [], sum(colour != "grey" for colour in colours.values())
     stds = {reported.name: reported.curve(metric.std_name) for reported in runs}
     for name in sorted(curves, key=lambda name: colours[name] == "grey"):
         (steps, values), colour = curves[name], colours[name]
@@ -209,7 +209,7 @@ def _draw_metric(
     all_steps = np.concatenate([steps for steps, _ in curves.values()])
     extent = np.array([all_steps.min() if np.ptp(all_steps) else 0.0, all_steps.max()])
     if random_mean is not None:
-        lines.append(Line(extent, np.full(2, random_mean), "grey dashed", label="random actions"))
+        lines.append(Line(extent, np.full(2, random_mean), "grey dashed", label=WORDS["random"][0]))
     has_negative = any((finite(line.y) < 0).any() for line in lines)
     limits = (-1.0, 1.0) if metric.limits and has_negative else metric.limits
     final = ", ".join(f"{name} {_format_spread(finite(values[:, -1]))}" for name, (_, values) in curves.items())
@@ -229,7 +229,11 @@ def _hovers(curves: dict[str, Curve]) -> dict[float, str]:
     texts: dict[float, list[str]] = {}
     for name, (steps, values) in curves.items():
         for step, column in zip(steps, values.T, strict=True):
-            seeds = f" ({', '.join(map(format_number, column))})" if len(curves) == 1 and len(column) > 1 else ""
+            seeds = (
+                f" ({', '.join(format_number(x) if np.isfinite(x) else '-' for x in column)})"
+                if len(curves) == 1 and len(column) > 1
+                else ""
+            )
             if len(numbers := finite(column)):
                 lines = texts.setdefault(float(step), [f"step {step:,.0f}"])
                 lines.append(f"{name}: {format_number(numbers.mean())}{seeds}")
@@ -247,7 +251,7 @@ def _render_legend(runs: Sequence[ReportedRun], colours: dict[str, str], has_ran
     if n_seeds == 1 and len(entries) == 1:
         entries.append(("band c0", "± deviation over the episodes of an evaluation"))
     if has_random_mean:
-        entries.append(("grey dashed", "random actions"))
+        entries.append(("grey dashed", WORDS["random"][0]))
     if warmup:
         entries.append(("shade", "random steps before the first update"))
     return draw_legend(entries)

@@ -19,7 +19,7 @@ from lare_rl.runs.config_file import CONFIG, read_config
 from lare_rl.runs.directory import CHECKPOINT
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.tasks.trust import trust_environment
+from lare_rl.tasks.trust import trust_environment, trust_prefix
 from lare_rl.training.latent_functions import choose_functions
 
 __all__ = ["Job", "check_job", "describe_job", "make_job", "train_job"]
@@ -38,7 +38,7 @@ class Job:
     resolved: ResolvedSettings
     """These settings with all defaults."""
     functions: tuple[Path, ...] = ()
-    """Files of latent functions, one for each team. Empty if the recorded replies are used."""
+    """Files of latent functions, one for each team. Empty if the recorded replies are used, or if the method has no phi."""
 
     @property
     def name(self) -> str:
@@ -74,7 +74,7 @@ class Job:
 def make_job(root: Path, task: TaskSpec, settings: Settings, functions: Sequence[Path] = ()) -> Job:
     """Plan a run in ROOT/TASK/METHOD-ALGORITHM[-drawK][-candidatesN]. Raises `LareError` if settings and task do not fit together.
 
-    The name of a run with a recorded `phi` has its draw, and the number of candidates if it is not 5.
+    The name of a run with a recorded `phi` has its draw, and the number of candidates if it is not the default.
     """
     resolved = resolve(settings, task)
     name = f"{resolved.method}-{resolved.algorithm}"
@@ -110,7 +110,9 @@ def check_job(job: Job) -> None:
     different_names = [name for name, value in new.items() if old.get(name) != value]
     if different_names:
         name = different_names[0]
-        command = f"lare-rl train --resume {shlex.quote(str(job.directory))} --steps {new['steps']}"
+        command = (
+            f"{trust_prefix(job.task)}lare-rl train --resume {shlex.quote(str(job.directory))} --steps {new['steps']}"
+        )
         can_extend = different_names == ["steps"] and new["steps"] > old["steps"]
         hint = f"extend it with {command}, or {ANOTHER_OUT}" if can_extend else ANOTHER_OUT
         raise LareError(f"{job.directory} holds a run with {name} = {old.get(name)}, not {new[name]}: {hint}")
@@ -132,7 +134,8 @@ def train_job(description: dict[str, Any]) -> None:
     """Train the run that `describe_job` describes, or resume it."""
     directory, task = Path(description["directory"]), TaskSpec(**description["task"])
     if (directory / CONFIG).is_file():
-        trust_environment(task)
+        trust_environment(task)  # resume reads the task from the directory, and this one comes from the user
+        read_metrics(directory)  # raises an error if they are damaged, which resume of a finished run does not notice
         lare_rl.resume(directory)
     else:
         lare_rl.train(

@@ -1,8 +1,8 @@
 """Gradient updates of the decoders: which steps an update reads, the update, and the first fit for many agents.
 
-The first fit lasts until the error on held-out episodes stops falling. As published, a decoder is fitted in 50 updates to the first
-episodes and, after every tenth iteration, in 50 more. With 15 agents that is too few: the policy has settled before the decoder is
-accurate (benchmarks/results/agents.md).
+The first fit lasts until the error on held-out episodes stops falling. With `first_fit = "published"`, a decoder is fitted in 50 updates
+to the first episodes and, after every tenth iteration, in 50 more. With 15 agents that is too few: the policy has settled before the
+decoder is accurate (benchmarks/results/agents.md).
 """
 
 import dataclasses
@@ -53,8 +53,9 @@ PATIENCE = 2
 MAX_ROUNDS = 40
 """The most rounds of a first fit."""
 BATCH_DIVISOR = 8
-"""An update of the first fit reads the steps of a later update, divided by this. There are few episodes yet, and large updates would
-read each of them several times. The decoder becomes as accurate in an eighth of the time (benchmarks/first_fit.py)."""
+"""An update of the first fit reads fewer steps than a later one: their number divided by this, but at least those of one episode. There are
+few episodes yet, and large updates would read each of them several times. The decoder becomes as accurate in an eighth of the time
+(benchmarks/first_fit.py)."""
 
 
 class FirstFitStoppedError(Exception):
@@ -157,9 +158,8 @@ def fit_until_converged(
         FirstFitStoppedError: the user has asked the run to stop.
     """
     # The learner is copied, here and below, because each round consumes it.
-    hidden_fields = ("current_episode", "running", "segments")
-    unhidden = {name: jax.tree.map(jnp.copy, getattr(learner.replay, name)) for name in hidden_fields}
-    n_hidden = jax.vmap(partial(_count_held_out, window=config.credit_specs[0].n_assessed))(
+    originals = {name: jax.tree.map(jnp.copy, getattr(learner.replay, name)) for name in replay.HIDING_FIELDS}
+    n_held_out = jax.vmap(partial(_count_held_out, window=config.credit_specs[0].n_assessed))(
         replay.segments_as_episodes(learner.replay)
     )
     compute_error = jit_over_seeds(jax.vmap(partial(_held_out_error, config=config)), config.n_devices)
@@ -170,10 +170,10 @@ def fit_until_converged(
         if stop_requested():
             raise FirstFitStoppedError
         round_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
-        learner, new_metrics = fit(learner._replace(replay=replay.hide_newest(learner.replay, n_hidden)), round_keys)
-        full = learner.replay._replace(**jax.tree.map(jnp.copy, unhidden))
+        learner, new_metrics = fit(learner._replace(replay=replay.hide_newest(learner.replay, n_held_out)), round_keys)
+        full = learner.replay._replace(**jax.tree.map(jnp.copy, originals))
         learner = learner._replace(replay=full)
-        error = np.asarray(compute_error(learner.decoders, full, n_hidden))
+        error = np.asarray(compute_error(learner.decoders, full, n_held_out))
         # How long a seed is fitted does not depend on the other seeds.
         is_better = (error < best_error) & (rounds_without_gain < PATIENCE)
         best_decoders = select(jnp.asarray(is_better), learner.decoders, best_decoders)
@@ -186,9 +186,10 @@ def fit_until_converged(
 
 
 def _count_held_out(buffer: Replay, window: int) -> Int[Array, " envs"]:
-    """Return how many of each environment's newest episodes are held out: a fifth of all, but at most `window`.
+    """Return how many of each environment's newest episodes are held out.
 
-    They are from the last environments first.
+    A fifth of the episodes of all environments together is held out, but at most `window`, as many as `Predictions` holds. They are taken
+    from the last environment first, then from the one before it.
     """
     available = replay.n_stored_episodes(buffer)
     count = jnp.minimum(jnp.sum(available) // 5, window)
@@ -197,12 +198,12 @@ def _count_held_out(buffer: Replay, window: int) -> Int[Array, " envs"]:
 
 
 def _held_out_error(
-    decoders: Decoders, buffer: Replay, n_hidden: Int[Array, " envs"], config: CreditConfig
+    decoders: Decoders, buffer: Replay, n_held_out: Int[Array, " envs"], config: CreditConfig
 ) -> Float[Array, ""]:
-    """Return the squared error of the returns of held-out episodes, summed over the teams, each in units of its returns."""
+    """Return the sum over the teams of the squared error of held-out returns, divided by the mean square of the team's returns."""
     spec = config.credit_specs[0]
     decoders = tuple(decoder._replace(predictions=empty_predictions(1, spec.n_assessed)) for decoder in decoders)
-    since = replay.segments_as_episodes(buffer).current_episode - n_hidden
+    since = replay.segments_as_episodes(buffer).current_episode - n_held_out
     decoders = fold_episodes(
         decoders, buffer, since, lambda decoder, episodes, _: learning.predict(decoder, episodes, spec), config
     )

@@ -1,9 +1,9 @@
 """How the decoders learn from finished episodes: predict their returns, add them to sufficient statistics, fit.
 
-In this order, `credit/return_r2` is measured on returns before anything is fitted to them.
+In this order, the metric `credit/return_r2` is measured on returns before anything is fitted to them.
 
-`learn_returns` is written for all seeds: steps are read in lockstep, and closed-form fits are made when they are due, of all seeds at
-once or of one after the other (`vectorized`). Call it within `float64()`, because `closed_form.py` needs float64.
+`learn_returns` is written for all seeds, which read their steps together. Closed forms that are due are fitted together if
+`config.vectorized`, else seed by seed. Call it within `float64()`, because `closed_form.py` needs float64.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ from lare_rl.nn.normalise import RunningMeanStd
 from lare_rl.training.decoder_inputs import episode_batch
 from lare_rl.training.learner import Learner
 
-__all__ = ["Decoders", "fold_episodes", "learn_returns", "predict_returns"]
+__all__ = ["Decoders", "fold_episodes", "learn_returns", "store_predicted_returns"]
 
 MAX_ROWS = 8000
 """The most rows of decoder inputs that are read at a time, unless a single episode has more."""
@@ -40,31 +40,35 @@ State = TypeVar("State")
 
 
 def learn_returns(learner: Learner, config: CreditConfig) -> Learner:
-    """Let decoders learn from finished episodes, and predict returns anew, when there are enough new ones. All arrays have a seed axis."""
+    """Let decoders learn from finished episodes when there are enough new ones. All arrays have a seed axis.
+
+    With `exact`, except for rollouts, then store new predictions of returns.
+    """
     buffer, n_learned = replay.segments_as_episodes(learner.replay), learner.n_learned
     n_before = jnp.sum(n_learned, axis=1)
-    n_new = jnp.sum(buffer.current_episode, axis=1) - n_before
-    is_due = n_new >= jnp.maximum(learning.MIN_GROWTH * n_before, 1)
-    learn = partial(_learn_if_due, buffer=buffer, n_learned=n_learned, is_due=is_due, config=config)
-    decoders = jax.lax.cond(jnp.any(is_due), learn, lambda unchanged: unchanged, learner.decoders)
-    n_now = jnp.where(is_due[:, None], buffer.current_episode, n_learned).astype(n_learned.dtype)
+    n_new = jnp.sum(buffer.current_episode, axis=1) - n_before  # current_episode: episodes ever finished
+    has_enough_new = n_new >= jnp.maximum(learning.MIN_GROWTH * n_before, 1)
+    learn = partial(_learn_if_due, buffer=buffer, n_learned=n_learned, has_enough_new=has_enough_new, config=config)
+    decoders = jax.lax.cond(jnp.any(has_enough_new), learn, lambda unchanged: unchanged, learner.decoders)
+    n_now = jnp.where(has_enough_new[:, None], buffer.current_episode, n_learned).astype(n_learned.dtype)
     learned = learner._replace(decoders=decoders, n_learned=n_now)
     if not config.is_exact or config.consumes is Consumes.ROLLOUTS:  # rollouts: predicted with each update
         return learned
     (old, *_), (new, *_) = map(_closed_forms, (learner.decoders, decoders))
-    is_new = (old.n_fitted != new.n_fitted)[:, None]  # a new fit changes the proxy rewards of all episodes
-    since = jnp.where(is_new, buffer.oldest, jnp.where(is_due[:, None], n_learned, buffer.current_episode))
-    return jax.vmap(partial(predict_returns, config=config))(learned, since)
+    # A new fit changes the proxy rewards of all episodes. After a rebuild, it may count as many episodes as the old one.
+    is_new = ((old.n_fitted != new.n_fitted) | (old.n_steps != new.n_steps))[:, None]
+    since = jnp.where(is_new, buffer.oldest, jnp.where(has_enough_new[:, None], n_learned, buffer.current_episode))
+    return jax.vmap(partial(store_predicted_returns, config=config))(learned, since)
 
 
-def predict_returns(learner: Learner, since: Int[Array, " envs"], config: CreditConfig) -> Learner:
+def store_predicted_returns(learner: Learner, since: Int[Array, " envs"], config: CreditConfig) -> Learner:
     """Predict the returns of one seed's episodes anew, from the episode `since` of each environment on, and store them in the replay."""
     buffer = replay.segments_as_episodes(learner.replay)
     slots = buffer.first.shape[-1]
 
     def body(state: tuple[DecoderState, Array], episodes: CreditBatch, first: Index) -> tuple[DecoderState, Array]:
         decoder, predicted = state
-        # A payment belongs to the episode of its last step; its first step may lie in the episode before.
+        # A payment belongs to the segment of its last step; with `paid_for`, its first step may lie in an earlier segment.
         last = first.number + episodes.length - 1
         episode = replay.look_up(buffer.episode, first.env, last)
         slot = jnp.where(episodes.mask > 0, episode % slots, slots)  # an index out of range, which is dropped
@@ -82,25 +86,28 @@ def _learn_if_due(
     decoders: Decoders,
     buffer: Replay,
     n_learned: Int[Array, "seeds envs"],
-    is_due: Bool[Array, " seeds"],
+    has_enough_new: Bool[Array, " seeds"],
     config: CreditConfig,
 ) -> Decoders:
-    since = jnp.where(is_due[:, None], n_learned, buffer.current_episode)
+    since = jnp.where(has_enough_new[:, None], n_learned, buffer.current_episode)
     decoders = jax.vmap(partial(_predict_then_update, config=config))(decoders, buffer, since)
     closed = _closed_forms(decoders)
     if not closed:
         return decoders
     if config.method.fit is not Fit.SIGNS:  # signs need no standardised factors
         statistics = tuple(decoder.statistics for decoder in decoders)
-        is_stale = is_due & jax.vmap(closed_form.is_stale)(closed[0], statistics[0])
+        is_stale = has_enough_new & jax.vmap(closed_form.is_stale)(closed[0], statistics[0])
         rebuild = jax.vmap(partial(_rebuild_sums, config=config))
         inputs = closed, statistics, buffer, is_stale
         closed = jax.lax.cond(jnp.any(is_stale), rebuild, lambda unchanged, *_: unchanged, *inputs)
     return tuple(
         _fit_seeds(
-            decoder._replace(closed_form=team), is_due & jax.vmap(closed_form.is_due)(team), spec, config.vectorized
+            decoder._replace(closed_form=form),
+            has_enough_new & jax.vmap(closed_form.is_due)(form),
+            spec,
+            config.vectorized,
         )
-        for decoder, team, spec in zip(decoders, closed, config.credit_specs, strict=True)
+        for decoder, form, spec in zip(decoders, closed, config.credit_specs, strict=True)
     )
 
 
@@ -125,6 +132,7 @@ def fold_episodes(
         expected: about how many episodes there are; None if they may be many.
     """
     buffer = replay.segments_as_episodes(buffer)
+    # `learning.predict` stores at most `n_assessed` predictions.
     longest, n_episodes = config.longest_segment, config.credit_specs[0].n_assessed
     expected = n_episodes if expected is None else max(1, expected)
     rows = max(1, min(expected, n_episodes, MAX_ROWS // (config.n_proxy_rewards * longest))) * longest
@@ -137,7 +145,7 @@ def fold_episodes(
         first = sample.episodes.first
         states = tuple(body(state, episode_batch(steps, sample, config, i), first) for i, state in enumerate(states))
         n_read = jnp.sum(sample.episodes.mask > 0)
-        return start + jnp.maximum(n_read, 1), states  # an episode with too many steps is left out
+        return start + jnp.maximum(n_read, 1), states  # an episode longer than `longest_segment` is left out
 
     return jax.lax.while_loop(lambda carry: carry[0] < total, read_batch, (jnp.zeros_like(total), states))[1]
 

@@ -10,7 +10,7 @@ from lare_rl.algorithms.batches import Metrics, Rollout
 from lare_rl.config.train_config import TrainConfig
 from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.training.episodes import predict_returns
+from lare_rl.training.episodes import store_predicted_returns
 from lare_rl.training.learner import Learner
 from lare_rl.training.policy import policy_input
 from lare_rl.training.rewards import rewards
@@ -32,7 +32,7 @@ def _predict_newest_returns(learner: Learner, config: TrainConfig) -> Learner:
     """Predict the returns of all episodes that end in the newest steps."""
     buffer = replay.segments_as_episodes(learner.replay)
     since = replay.look_up(buffer.episode, jnp.arange(config.n_envs), buffer.next_transition - config.rollout_steps)
-    return predict_returns(learner, since, config)
+    return store_predicted_returns(learner, since, config)
 
 
 def _rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> Rollout:

@@ -24,7 +24,7 @@ __all__ = ["EFFECT_KINDS", "CreditedTurns", "FeatureEffect", "TurnCredit"]
 MAX_SENTENCES = 8
 """The largest number of features that are described in words."""
 EFFECT_KINDS = {"first": (COUNT, HAPPENED, LAST), "lasting": (COUNT, HAPPENED), "further": (COUNT,)}
-"""For each effect of a feature (see `FeatureEffect`), the kinds of the features of prefixes whose weights add up to it."""
+"""For each effect (see `FeatureEffect`): it is the sum of the weights of the prefix features of these kinds."""
 
 TurnValues = list[Float[np.ndarray, " _"]]
 """One array for each rollout, with one number for each of its turns."""
@@ -33,11 +33,11 @@ TurnValues = list[Float[np.ndarray, " _"]]
 class FeatureEffect(NamedTuple):
     """How a feature of a turn changes the value, in the unit of outcomes.
 
-    Each effect is that of a feature of the size `unit`, and has its posterior standard deviation.
+    Each effect is that of a feature of the size `feature_size`, and has its posterior standard deviation.
     """
 
     name: str
-    unit: float
+    feature_size: float
     """The mean size of the feature in the turns where it is not 0."""
     frequency: float
     """The share of the turns where it is not 0."""
@@ -80,17 +80,17 @@ class CreditedTurns:
 
     @property
     def is_grpo(self) -> bool:
-        """Whether the values are not trusted. All turns of a rollout then have the same advantage, as in GRPO: R - `group_means`."""
+        """Whether the values are not trusted, so that all turns of a rollout have the same advantage (`turns/trust.py`)."""
         return self.reason.code in UNTRUSTED
 
     @property
     def gain(self) -> float:
-        """The share of the squared error of `group_means` that the values remove."""
+        """`Trust.gain`."""
         return self.trust.gain
 
     @property
     def surprise(self) -> float:
-        """The mean of the outcome minus the value before the last turn of agents that stopped by themselves."""
+        """`Trust.surprise`."""
         return self.trust.surprise
 
     @property
@@ -100,7 +100,7 @@ class CreditedTurns:
 
     @property
     def findings(self) -> list[Finding]:
-        """The same as findings, whose sentences are in `turns/words.py`."""
+        """What `words` says, as findings; `turns/words.py` has their sentences."""
         clear = [effect for effect in self.effects if abs(effect.first) > CLEAR_ERRORS * effect.first_std]
         clear.sort(key=lambda effect: -effect.importance)
         decimals = count_decimals(self.trust.outcome_std)
@@ -120,7 +120,7 @@ class TurnCredit:
         """Make an object that has seen no rollouts.
 
         Args:
-            lambda_: of generalized advantages, 0 to 1. None: the trust in the values decides between 0.8, 0.95 and 1.
+            lambda_: of generalized advantages, 0 to 1. None: the trust in the values decides (`turns/trust.py`).
             window: the number of calls over which trust is measured.
             phi: a function from a turn to numbers with names, such as `load_turn_phi` reads. It needs rollouts with messages.
 
@@ -187,5 +187,5 @@ def _describe_effects(table: TurnTable, prefixes: Prefixes, fit: PrefixFit) -> t
             row = size * np.isin(prefixes.kind, kinds)
             numbers[effect] = float(row @ fit.weight)
             numbers[f"{effect}_std"] = float(np.linalg.norm(fit.root[:, :-1] @ row))
-        effects.append(FeatureEffect(name=name, unit=unit, frequency=float(is_nonzero.mean()), **numbers))
+        effects.append(FeatureEffect(name=name, feature_size=unit, frequency=float(is_nonzero.mean()), **numbers))
     return tuple(effects)

@@ -151,7 +151,7 @@ def _render_effects(credit: CreditedTurns) -> str:
     for effect in sorted(credit.effects, key=lambda effect: -effect.importance):
         pairs = ((getattr(effect, name), getattr(effect, f"{name}_std")) for name in EFFECT_KINDS)
         numbers = (_format_change(*pair, decimals) if round(max(map(abs, pair)), decimals) else "0" for pair in pairs)
-        name = effect.name if effect.unit == 1 else f"{effect.name} ({effect.unit:.3g})"
+        name = effect.name if effect.feature_size == 1 else f"{effect.name} ({effect.feature_size:.3g})"
         rows.append((name, f"{effect.frequency:.0%}", *numbers))
     header = ("feature of a turn", "turns with it", "the first one", "what lasts", "each further one")
     return render_table(header, rows, numbers=(1, 2, 3, 4))

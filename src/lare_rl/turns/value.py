@@ -48,7 +48,7 @@ def values(table: TurnTable, x: Float[np.ndarray, "turns features"], fit: Prefix
 
 
 def changes(table: TurnTable, value: Float[np.ndarray, " turns"]) -> Float[np.ndarray, " turns"]:
-    """Return the change of value of each turn. The changes of a rollout add up to its outcome minus its first value."""
+    """Return the change of value of each turn."""
     next_value = np.append(value[1:], 0)
     next_value[table.last] = table.outcome
     return next_value - value

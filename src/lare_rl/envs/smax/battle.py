@@ -2,7 +2,7 @@
 
 A step of half a second has 8 ticks. In each tick, all units act at once, with the positions x, health h and cooldowns c before it:
 
-    i hits j     if i has chosen to attack j, |x_i - x_j| < reach_i, c_i <= 0, and both are alive
+    i hits j     if i has chosen to attack j, |x_i - x_j| < attack_range_i, c_i <= 0, and both are alive
     x_i <- x_i + TICK * speed_i * direction_i             clipped to the field; dead units do not move
     h_j <- max(0, h_j - sum of damage_i over the i that hit j)
     c_i <- cooldown_i + u, u uniform in [-TICK, 2 TICK)   if i hits, else c_i - TICK, without a lower bound

@@ -18,12 +18,12 @@ __all__ = ["SCENARIOS", "UNIT_TYPES", "Scenario", "UnitType", "find_scenario"]
 
 
 class UnitType(NamedTuple):
-    """The stats of all units of a type. Lengths are in units of the field, times in seconds."""
+    """The stats of all units of a type. Lengths are on the scale of the field, whose side is 32 (`battle.FIELD`); times are in seconds."""
 
     speed: float
     damage: float
     attack_range: float
-    """An attack hits a unit whose centre is nearer than this."""
+    """See `battle.py`: a distance between centres."""
     sight: float
     radius: float
     health: float
@@ -53,7 +53,7 @@ class Scenario:
     max_steps: int
     """The maximum length of an episode."""
     n_unit_types: int = 6
-    """The number of types in the one-hot encoding of observations and states."""
+    """The length of a type's one-hot encoding: 6 as in JaxMARL, or 7 in a scenario with a colossus."""
 
     @property
     def n_allies(self) -> int:
