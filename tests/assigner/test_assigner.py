@@ -264,8 +264,14 @@ def test_step_with_an_infinite_factor_costs_only_the_episodes_that_wait(chase, t
     assert credit.metrics()["credit/dropped"] == 2
     assert credit.metrics()["credit/episodes"] == 3
     assert [len(episode.step_ids) for episode in credit.store.episodes.values()] == [4, 6]
+    for episode in random_episodes([6] * 8, seed=1):
+        credit.add_episode(*episode)
+    credit.fit()
+    assert float(credit.learner.decoder.closed_form.n_steps) > 30  # the sums are still rebuilt
     credit.save(tmp_path / "credit")
-    assert list(CreditAssigner.load(tmp_path / "credit").store.episodes) == [0, 2]
+    loaded = CreditAssigner.load(tmp_path / "credit")
+    assert list(loaded.store.episodes) == [0, *range(2, 11)]
+    assert loaded.store.n_forgotten == 1
 
 
 def test_several_threads_may_use_an_assigner():
@@ -626,6 +632,27 @@ def test_groups_that_do_not_fit_are_refused():
         credit.add_episode(*episode, group=f"g{i}")
     with pytest.raises(LareError, match=r"more than 64 groups.*'new'"):
         credit.add_episode(*episode, group="new")
+
+
+def test_signs_with_groups(chase):
+    """Signs have no intercepts of groups."""
+    phi = verify_function("def evaluation_func(o, a):\n    return [o[:, :1], o[:, 1:]]", chase)
+    credit = small_assigner("lare-signs", phi, groups=True)
+    for i, episode in enumerate(random_episodes([4, 5, 6])):
+        credit.add_episode(*episode, group=str(i))
+    credit.fit()
+    assert set(np.abs(np.asarray(credit.learner.decoder.closed_form.decoder.weight)).ravel()) == {1}
+
+
+@pytest.mark.parametrize("exact", ["last", "spread"])
+def test_exact_needs_an_agent_at_every_step(exact):
+    settings = SMALL_CREDIT.model_copy(update={"exact": exact})
+    credit = small_assigner("rd-linear", agents=2, settings=settings)
+    states, action, alive = np.zeros((3, 2, 2)), np.zeros((3, 2, 1)), np.ones((3, 2), bool)
+    credit.add_episode(states, action, states, 1.0, alive=alive)
+    alive[2] = False
+    with pytest.raises(LareError, match="exact"):
+        credit.add_episode(states, action, states, 1.0, alive=alive)
 
 
 def test_end_needs_the_group_of_a_step():

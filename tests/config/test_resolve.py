@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 
 from helpers.jax_toy_envs import echo_spec
-from helpers.small_configs import ONE_TEAM, SUM_CREDIT, TWO_TEAMS, small_config
+from helpers.small_configs import ONE_AGENT, ONE_TEAM, SUM_CREDIT, TWO_TEAMS, small_config
 from helpers.toy_envs import pick_spec, toy_spec
 from lare_rl.algorithms.qmix import QMIXSettings
 from lare_rl.config.resolve import resolve
@@ -214,6 +214,14 @@ def test_check_training_refuses_a_loop_that_does_not_fit():
     check_training(small_config("rd", "ppo", credit=exact))
     with pytest.raises(LareError, match="off-policy"):
         check_training(small_config("rd", "td3", credit=exact))
+    spread = SUM_CREDIT.model_copy(update={"exact": "spread"})
+    check_training(small_config("bayes", "td3", credit=spread))
+    check_training(
+        small_config("rd", "ppo", credit=spread, rollout_steps=24, env=replace(ONE_AGENT, fixed_length=True))
+    )
+    for env in (ONE_AGENT, replace(ONE_AGENT, fixed_length=True)):
+        with pytest.raises(LareError, match="use exact = 'last'"):
+            check_training(small_config("rd", "ppo", credit=spread, rollout_steps=20, env=env))
     with pytest.raises(LareError, match="a team of several may have left"):
         check_training(small_config("rd", "ippo", env=TWO_TEAMS, credit=exact))
 

@@ -59,6 +59,21 @@ def test_scales_of_rewards_and_features_do_not_matter():
         np.testing.assert_allclose(r_hat, scaled_r_hat / unit, rtol=2e-2, atol=2e-2)
 
 
+@pytest.mark.parametrize("is_average", [False, True])
+def test_sum_form_weighs_sums_by_their_lengths_and_averages_equally(is_average):
+    """In units of the returns' scale, the error of both episodes is 1 for an average, and 1/T for a mean reward."""
+    settings = CreditSettings(hidden=(), sum_form=True, score="average" if is_average else "sum", normalise=False)
+    spec = observation_spec(1, METHODS["rd"], settings, 4)
+    state = decoder_state.init(KEY, spec)._replace(is_average=jnp.array(is_average))
+    state = state._replace(network=jax.tree.map(jnp.zeros_like, state.network))  # r_hat = 0
+    losses = []
+    for length in (2, 4):
+        ones = jnp.ones(1)
+        batch = CreditBatch(jnp.zeros((length, 1, 1)), jnp.zeros(length, int), jnp.array([length]), ones / length, ones)
+        losses.append(float(update(state, batch, KEY, spec)[1]["credit/loss"]))
+    np.testing.assert_allclose(losses, 1, rtol=1e-5)
+
+
 @pytest.mark.parametrize("score_type", [0, 1])
 def test_unit_of_proxy_rewards(score_type):
     """A decoder's output is in units of R/T. If the score is a mean, it is in units of R, and a step gets a T-th of it."""

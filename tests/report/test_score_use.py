@@ -28,6 +28,7 @@ def describe(method="bayes", metrics=METRICS, task=None, equal_lengths=False, **
         ("bayes", {"gain": 0.35, "gain_error": 0.2}, {}, {}, ["It is not clear", "35% ± 20%"]),
         ("bayes", {"gain": 0.95}, {}, {}, ["can be trusted", "95%"]),
         ("rd", {"average": 1.0}, {}, {}, ["average"]),
+        ("rudder", {}, {"score": "average"}, {}, ["sum over the steps"]),  # it does not read the score
         ("bayes", {}, {"payments": 5}, {"exact": "spread"}, ["every 5 steps", "mean payment", "spread"]),
         ("bayes", {}, {"group": "map"}, {}, ["intercept for each group", "mean of their group"]),
         ("bayes", {"log_odds": 1.0, "gain": 0.2}, {}, {"score": "binary"}, ["log odds", "chance"]),

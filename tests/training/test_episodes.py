@@ -20,7 +20,7 @@ from helpers.small_configs import (
     small_config,
     untrained_learner,
 )
-from lare_rl.credit import closed_form, decoder_state, learning
+from lare_rl.credit import closed_form, decoder_state, learning, logistic
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.data import replay
@@ -158,6 +158,22 @@ def test_learn_returns_finds_the_score_type(method, score):
     for untrained in (config, fixed):
         decoder = untrained_learner(untrained).decoders[0]
         assert learning.estimate_score_type(decoder, untrained.credit_specs[0]) is None
+
+
+def test_a_rebuild_fits_the_log_odds_to_the_last_episodes_of_all_environments(monkeypatch):
+    """All sums are made anew with the second chunk of steps. The return of episode k of environment i is 10 i + k."""
+    monkeypatch.setattr(logistic, "WINDOW", 8)
+    config = small_config("rd-linear", n_envs=4, capacity=200, credit=CreditSettings(score="binary"))
+    steps = random_steps(envs=4, lengths=(3,) * 9)
+    steps.next_timestep.reward[:] = 0
+    steps.next_timestep.reward[2::3, :, 0] = 10 * np.arange(4) + np.arange(9)[:, None]
+    for rows in (slice(0, 9), slice(9, None)):
+        chunk = jax.tree.map(lambda leaf, rows=rows: leaf[rows], steps)
+        learner = untrained_learner(config) if rows.start == 0 else learner
+        learner = add_steps(learner, config, chunk, None, learn=True)
+    fit = learner.decoders[0].closed_form
+    assert float(fit.n_steps) == 4 * 27
+    assert sorted(fit.log_odds.returns.round().tolist()) == [10 * i + k for i in range(4) for k in (7, 8)]
 
 
 def test_score_types_that_are_fitted():

@@ -65,6 +65,10 @@ def read_steps(
         if config.agents == 1:
             raise LareError("this assigner has a single agent: leave alive out")
         alive = to_flags(alive, "alive", n_rows, config.agents)
+        if config.spec.is_exact and not alive.any(axis=1).all():
+            raise LareError(
+                "with exact, an agent must act at every step of an episode, or part of its return is lost: use exact = 'no'"
+            )
     team_reward = _to_team_reward(config, reward, alive, n_rows)
     ended = to_flags(terminated, "terminated", n_rows) | to_flags(truncated, "truncated", n_rows)
     rows = np.flatnonzero(np.ones(n_rows, bool) if valid is None else to_flags(valid, "valid", n_rows))

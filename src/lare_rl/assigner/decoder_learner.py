@@ -217,7 +217,7 @@ class DecoderLearner:
             return decoder
         # New sums have only the stored episodes. Training may forget episodes that were overwritten. After a load without episodes, the old
         # sums are all that is known of them.
-        are_all_stored = len(self.store.episodes) == self.store.n_ended
+        are_all_stored = len(self.store.episodes) + self.store.n_forgotten == self.store.n_ended
         may_rebuild = are_all_stored or (self.config.forget and self.store.oldest_step > 0)
         if self.config.method.fit is not Fit.SIGNS and may_rebuild and compiled.is_stale(closed, decoder.statistics):
             closed = compiled.reset_statistics(closed, decoder.statistics)

@@ -59,7 +59,8 @@ def get_state(learner: DecoderLearner, group_names: Iterable[GroupName], *, epis
     leaves = named_leaves((learner.decoder,))
     arrays = {LEARNED + name: np.asarray(leaf) for name, leaf in leaves.items()}
     n_lost = sum(not episode.is_abandoned for episode in store.running.values())  # running episodes are not saved
-    arrays["counts"] = np.array([store.n_ended, store.n_ended_steps, store.dropped + n_lost, store.max_ended_steps])
+    counts = store.n_ended, store.n_ended_steps, store.dropped + n_lost, store.max_ended_steps, store.n_forgotten
+    arrays["counts"] = np.array(counts)
     for name, chunks in zip(PHI_SAMPLE, zip(*learner.phi_sample, strict=True), strict=False):
         arrays[name] = np.concatenate(chunks)
     if episodes:
@@ -77,8 +78,9 @@ def restore(learner: DecoderLearner, state: AssignerState) -> None:
     with on_cpu():
         (learner.decoder,) = fill_template((learner.decoder,), learned)
     store = learner.store
-    counts = map(int, np.append(arrays["counts"], 1)[:4])  # an earlier version has three
-    store.n_ended, store.n_ended_steps, store.dropped, store.max_ended_steps = counts
+    counts = arrays["counts"].tolist()
+    counts += [0, 0, 0, 1, 0][len(counts) :]  # earlier versions have three or four
+    store.n_ended, store.n_ended_steps, store.dropped, store.max_ended_steps, store.n_forgotten = map(int, counts)
     if "n_added" in arrays:
         _restore_store(store, arrays)
 

@@ -104,6 +104,8 @@ class Store:
         """The number of payments that were ever stored: of episodes that have ended, if each is paid once."""
         self.n_ended_steps = 0
         """The number of steps that these payments are for, in total."""
+        self.n_forgotten = 0
+        """The number of payments of `n_ended` that `forget_since` removed."""
         self.max_ended_steps = 1
         """The largest number of steps that any of these payments is for."""
         self.oldest: list[tuple[int, int]] = []
@@ -328,6 +330,7 @@ class Store:
                 self._abandon(episode)
         n_before = len(self.episodes)
         self.episodes = {n: episode for n, episode in self.episodes.items() if episode.step_ids[-1] < step_id}
+        self.n_forgotten += n_before - len(self.episodes)
         self.dropped += n_before - len(self.episodes)
         self.oldest = [entry for entry in self.oldest if entry[1] in self.episodes]
         heapq.heapify(self.oldest)

@@ -85,6 +85,12 @@ def check_training(config: CreditConfig) -> None:
         raise LareError(
             "exact adds to the rewards of an episode's last step, at which a team of several may have left: use exact = 'no'"
         )
+    is_cut = not config.has_fixed_segments or rollout_steps % config.longest_segment
+    if config.is_exact and config.credit.exact == "spread" and config.consumes is Consumes.ROLLOUTS and is_cut:
+        raise LareError(
+            f"exact = 'spread' pays at all steps of an episode, and those in an earlier rollout (rollout_steps = {rollout_steps}) are "
+            "paid already: use exact = 'last'"
+        )
     if config.consumes is not Consumes.ROLLOUTS and method.uses_gradient and config.credit.exact != "no":
         raise LareError(
             "exact needs proxy rewards that stay the same during an iteration, and the updates of an off-policy algorithm change "

@@ -231,7 +231,7 @@ def level_returns(
         return value
     if state.levels is not None:
         return value + level_offsets(state.levels)[level] * length
-    if closed is None:
+    if closed is None or not closed.intercept.shape[1]:  # signs have no intercepts
         return value
     per_step = ~(state.is_average | state.is_log_odds | closed.decoder.basis.prefixes)
     return value + closed.intercept[index][level] * jnp.where(per_step, length, 1)

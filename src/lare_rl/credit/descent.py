@@ -98,6 +98,9 @@ def _mean_loss(
     """Return the loss of RD, RRD, RRD-unbiased or LRR, which compare the mean r_hat of an episode with R/T, plus the decoder's penalty."""
     fit, target, n_episodes = spec.method.fit, _targets(state, episodes, spec), len(episodes.length)
     weight = losses.episode_weight(episodes.length, episodes.mask, spec.settings.sum_form)
+    weight = jnp.where(
+        state.is_average, episodes.mask, weight
+    )  # the mean output of an average is its sum of rewards already
     output = decoder_state.decode(network, state, episodes.inputs, spec, key)
     agent_mean = partial(decoder_state.agent_mean, alive=episodes.alive)
     r_hat, n_steps = agent_mean(output.r_hat), episodes.length

@@ -30,6 +30,7 @@ from lare_rl.credit.spec import CreditSpec
 
 __all__ = [
     "MIN_GROWTH",
+    "add_to_log_odds",
     "add_to_sums",
     "estimate_score_type",
     "find_score_mismatch",
@@ -165,7 +166,7 @@ def _append_levels(
 
 def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     """Add whole episodes to the sums, in float64 if that is enabled. Episodes whose mask is 0 are ignored."""
-    statistics, log_odds = closed_form.to_float64(closed.sufficient_statistics), closed.log_odds
+    statistics = closed_form.to_float64(closed.sufficient_statistics)
     returns, mask = episodes.returns, episodes.mask > 0
     if closed.decoder.basis.prefixes:
         columns, is_step = _prefix_columns(closed.decoder, episodes), decoder_state.step_rows(episodes)
@@ -173,10 +174,15 @@ def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     else:
         columns = _columns(closed.decoder, episodes)
         statistics = evidence.add_episodes(statistics, columns, returns, jnp.where(mask, episodes.length, 0))
-        if log_odds is not None:
-            sums = _episode_sums(closed.decoder, columns, episodes)
-            log_odds = logistic.add_episodes(log_odds, sums, returns, mask)
-    return closed._replace(sufficient_statistics=closed_form.split_double(statistics), log_odds=log_odds)
+    return add_to_log_odds(closed._replace(sufficient_statistics=closed_form.split_double(statistics)), episodes)
+
+
+def add_to_log_odds(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
+    """Add whole episodes to the last ones, which the fit of log odds reads, if there is one. Episodes whose mask is 0 are ignored."""
+    if closed.log_odds is None:
+        return closed
+    sums = _episode_sums(closed.decoder, _columns(closed.decoder, episodes), episodes)
+    return closed._replace(log_odds=logistic.add_episodes(closed.log_odds, sums, episodes.returns, episodes.mask > 0))
 
 
 def fit_closed_form(state: DecoderState, spec: CreditSpec, *, vectorized: bool = False) -> DecoderState:

@@ -79,7 +79,7 @@ def summarise_score_use(
     """
     if method.fit is None:
         return None
-    is_average = metrics["average"] > 0.5 or settings.credit.score == "average"
+    is_average = metrics["average"] > 0.5 or ("score" in method.settings and settings.credit.score == "average")
     form = "form_mean" if is_average else "form_sum"
     if method.fit is Fit.PREFIX_EVIDENCE:
         form = "form_progress"

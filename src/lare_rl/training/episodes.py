@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Int
 
 from lare_rl.algorithms.registry import Consumes
 from lare_rl.config.train_config import CreditConfig
-from lare_rl.credit import closed_form, learning
+from lare_rl.credit import closed_form, learning, logistic
 from lare_rl.credit.closed_form import ClosedForm
 from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
@@ -168,7 +168,21 @@ def _rebuild_sums(
     """Add all stored episodes to new sums if `is_stale` is true, with features standardised by the current statistics."""
     empty = tuple(map(closed_form.reset_statistics, closed, statistics))
     since = jnp.where(is_stale, buffer.oldest, buffer.current_episode)
-    rebuilt = fold_episodes(empty, buffer, since, lambda state, batch, _: learning.add_to_sums(state, batch), config)
+    without_log_odds = tuple(form._replace(log_odds=None) for form in empty)
+    rebuilt = fold_episodes(
+        without_log_odds, buffer, since, lambda form, batch, _: learning.add_to_sums(form, batch), config
+    )
+    if closed[0].log_odds is not None:
+        # Episodes are read one environment after the other, and the fit of log odds is to the last ones of all environments.
+        n_recent = max(1, logistic.WINDOW // config.n_envs)
+        rebuilt = tuple(form._replace(log_odds=old.log_odds) for form, old in zip(rebuilt, empty, strict=True))
+        rebuilt = fold_episodes(
+            rebuilt,
+            buffer,
+            jnp.maximum(since, buffer.current_episode - n_recent),
+            lambda form, batch, _: learning.add_to_log_odds(form, batch),
+            config,
+        )
     return select(is_stale, rebuilt, closed)
 
 
