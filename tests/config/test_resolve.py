@@ -44,7 +44,7 @@ def resolve_named(task, settings):
         ("CN-6", {"algorithm": "vdn", "vdn": {"monotonic": True}}, ["vdn.monotonic = True", "use --algorithm qmix"]),
         ("CN-6", {"algorithm": "qmix", "qmix": {"monotonic": False}}, ["qmix.monotonic", "use --algorithm vdn"]),
         ("CN-6", {"algorithm": "qmix", "method": "rd", "capacity": 999}, ["capacity = 999", "iteration", "1000"]),
-        ("SMAX-2s3z", {"capacity": 10_000}, ["capacity = 10000 holds 80 of", "15488", "batch_size"]),
+        ("SMAX-2s3z", {"capacity": 10_000}, ["capacity = 10000 holds 72 of", "16456", "batch_size"]),
         (pick_spec(), {"algorithm": "sac"}, ["sac needs continuous actions", "ppo"]),
         (ECHO_STATE, {"method": "lare-rd-shared"}, ["lare-rd-shared", "credit_scope = 'state'"]),
         (ECHO_STATE, {"method": "stas"}, ["stas"]),

@@ -247,6 +247,25 @@ def test_second_learn_drops_running_episodes():
     assert np.abs(model.rollout_buffer.rewards).max() > 0
 
 
+def test_rest_of_an_episode_whose_beginning_was_not_seen(tmp_path):
+    """By a callback that comes later, and by a replay buffer that is loaded without its running episodes."""
+    model, credit = on_policy(make_envs(1)[0]), make_assigner(capacity=1000)
+    model.learn(32)
+    model.learn(64, callback=CreditCallback(credit, 5), reset_num_timesteps=False)
+    assert episode_lengths(credit) == [EPISODE_STEPS] * 2
+
+    model = off_policy(make_env(), make_assigner())
+    model.learn(30)
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    model.load_replay_buffer(tmp_path / "buffer.pkl")
+    model.learn(40, reset_num_timesteps=False)
+    assert episode_lengths(model.replay_buffer.credit) == [EPISODE_STEPS] * 2
+
+
+def episode_lengths(credit):
+    return [len(episode.step_ids) for episode in credit.store.episodes.values()]
+
+
 def test_save_and_load(tmp_path):
     """The file of a model has no episodes, the file of a replay buffer has them."""
     credit = make_assigner("rrdu", capacity=20_000)

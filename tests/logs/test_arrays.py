@@ -24,6 +24,14 @@ def test_round_trip_keeps_other_arrays(folder, tmp_path):
         assert all(np.array_equal(old[key], new[key]) for key in old if key != "rewards")
 
 
+def test_flat_arrays_with_a_score():
+    """Every row has one, and that of an episode's last row counts."""
+    states = np.zeros((5, 2))
+    flat = {"observations": states, "next_observations": states, "actions": np.zeros((5, 1)), "score": np.arange(5.0)}
+    log = open_log(flat | {"terminals": np.array([0, 1, 0, 0, 1])})
+    assert [float(episode.reward.sum()) for episode in log.episodes()] == [1, 4]
+
+
 def test_flat_arrays_of_d4rl(tmp_path):
     episodes = list(logged_episodes(5))
     columns = [

@@ -172,6 +172,17 @@ def test_bad_table(tmp_path, rows, message):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_files_that_count_their_episodes_from_0(tmp_path):
+    """Shards of one episode may lie in two files."""
+    half = N_ROWS // 2
+    pq.write_table(ROWS.slice(0, half), tmp_path / "a.parquet")
+    pq.write_table(ROWS.slice(half), tmp_path / "b.parquet")
+    assert len(list(open_log(tmp_path).episodes())) == 1
+    pq.write_table(ROWS, tmp_path / "c.parquet")
+    with pytest.raises(LareError, match=r"c\.parquet.*across files"):
+        list(open_log(tmp_path).episodes())
+
+
 def test_texts_of_any_type(tmp_path):
     """polars writes large strings, pandas dictionaries. A table of episodes may have a column of their ids."""
     path = tmp_path / "log.parquet"

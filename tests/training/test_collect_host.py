@@ -1,6 +1,7 @@
 """Collecting from environments on the host: steps, restored episodes, evaluations, and faults with their place."""
 
 import itertools
+from dataclasses import replace
 from functools import partial
 
 import gymnasium
@@ -11,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers.small_configs import SMALL_SETTINGS, small_config
+from helpers.small_configs import ONE_AGENT, SMALL_SETTINGS, small_config
 from helpers.toy_envs import pick_spec, toy_spec
 from lare_rl.envs.env_errors import EnvOutputError
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
-from lare_rl.envs.interface import EnvSpec, Team, to_env_action
+from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.training import collect_host
 from lare_rl.training.collect_host import HostCollector
@@ -164,6 +165,49 @@ def test_restore_drops_other_observations_and_episodes_that_end_early(wrap):
     collect(envs, 5)
     dropped, _ = envs.restore(envs.state_dict())
     assert dropped.all()
+
+
+class Unrepeatable:
+    """As SMAC: the seed has no effect, and an action that is not available is an error."""
+
+    spec = replace(ONE_AGENT, observation_size=1, action_size=3, discrete=True, masks_actions=True)
+    n_resets = 0
+
+    def reset(self, seed):
+        Unrepeatable.n_resets += 1
+        self.start, self.t = Unrepeatable.n_resets, 0
+        return self._timestep()
+
+    def step(self, action):
+        assert self._available()[0, np.argmax(action[0])]
+        self.t += 1
+        return self._timestep()
+
+    def render(self):
+        pass
+
+    def close(self):
+        pass
+
+    def _available(self):
+        return np.arange(3)[None] == (self.start + self.t) % 3
+
+    def _timestep(self):
+        observation = np.full((1, 1), self.start, np.float32)
+        return Timestep(
+            observation, np.zeros(0, np.float32), self._available(), np.ones(1, bool), np.zeros(1, np.float32),
+            np.array(False), np.array(self.t >= 12), {},
+        )  # fmt: skip
+
+
+def test_restore_drops_an_episode_whose_actions_are_not_available_any_more():
+    config = small_config("episodic", "ppo", Unrepeatable.spec, rollout_steps=4)
+    makers = [Unrepeatable]
+    envs, restored = (HostCollector(LocalVecEnv(makers), LocalVecEnv(makers), config, [0]) for _ in range(2))
+    envs.collect_by(lambda timestep, *_: timestep.available.astype(np.float32), np.zeros((4, 1, 1, 1, 3), np.float32))
+    dropped, (message,) = restored.restore(envs.state_dict())
+    assert dropped.all()
+    assert "dropped after 4 steps" in message
 
 
 def proportional(factor):

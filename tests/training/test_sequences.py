@@ -83,6 +83,22 @@ def test_sequences_are_the_stored_episodes(method):
         assert not batch.reward[i, length:].any()
 
 
+def test_agents_that_left_can_only_choose_the_first_action():
+    env = replace(ONE_TEAM, masks_actions=False)
+    config = qmix_config("episodic", env=env)
+    episodes = jax.jit(sample_distinct_episodes, static_argnums=2)
+    learner = learner_with_episodes(config)
+    sample = episodes(learner.replay, jax.random.key(0), 10)
+    batch = compute_sequences(learner, sample, 12, config)
+    steps, n_choices = random_steps(env, 2), np.asarray(batch.available).sum(axis=-1)
+    for i in range(10):
+        index, first = int(sample.first.env[i]), int(sample.first.number[i])
+        rows = next(rows for rows in episode_rows(steps, index) if rows[0] == first)
+        expected = np.where(steps.timestep.alive[rows, index], env.action_size, 1)
+        np.testing.assert_array_equal(n_choices[i, : len(rows)], expected)
+    assert np.asarray(batch.available)[..., 0].all()
+
+
 def test_mixer_input_is_the_standardised_state_or_all_observations():
     config, steps = qmix_config("dense"), random_steps(ONE_TEAM, 2)
     learner = learner_with_episodes(config)

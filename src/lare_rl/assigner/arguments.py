@@ -65,13 +65,13 @@ def read_steps(
         if config.agents == 1:
             raise LareError("this assigner has a single agent: leave alive out")
         alive = to_flags(alive, "alive", n_rows, config.agents)
-        if config.spec.is_exact and not alive.any(axis=1).all():
-            raise LareError(
-                "with exact, an agent must act at every step of an episode, or part of its return is lost: use exact = 'no'"
-            )
     team_reward = _to_team_reward(config, reward, alive, n_rows)
     ended = to_flags(terminated, "terminated", n_rows) | to_flags(truncated, "truncated", n_rows)
     rows = np.flatnonzero(np.ones(n_rows, bool) if valid is None else to_flags(valid, "valid", n_rows))
+    if config.spec.is_exact and alive is not None and not alive[rows].any(axis=1).all():
+        raise LareError(
+            "with exact, an agent must act at every step of an episode, or part of its return is lost: use exact = 'no'"
+        )
     ids = range(n_rows) if env_ids is None else list(map(to_env_id, _to_list(env_ids, "env_ids", n_rows)))
     # Copies, because an environment may write its next step into the same memory.
     observation, action, next_observation = (array[rows] for array in arrays)

@@ -229,6 +229,19 @@ class CreditAssigner:
         with self.lock:
             self.store.drop(arguments.to_env_id(env_id))
 
+    def skip_unseen(self, env_id: Any, observation: Float[np.ndarray, "*agents size"]) -> None:
+        """Learn nothing from the rest of an episode that is running already, if its first steps were not added.
+
+        `observation` is the present one, as a row. The next step of `env_id` continues the episode if it begins there.
+        """
+        with self.lock:
+            self.store.skip_unseen(arguments.to_env_id(env_id), observation)
+
+    def last_observation(self, env_id: Any) -> Float[np.ndarray, "*agents size"] | None:
+        """Return the observation, as a row, after the last step of the episode that is running; None without one."""
+        with self.lock:
+            return self.store.last_observation(arguments.to_env_id(env_id))
+
     def fit(self, updates: int = 500) -> None:
         """Fit now, by this many gradient updates of the decoder. A closed-form decoder is fitted once, whatever `updates` is."""
         if not isinstance(updates, Integral):

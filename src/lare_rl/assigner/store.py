@@ -313,6 +313,16 @@ class Store:
         self.running[env_id] = episode  # now the last of all environments
         return episode
 
+    def last_observation(self, env_id: Hashable) -> Float[np.ndarray, "*agents observation"] | None:
+        """Return the observation after the last step of the running episode of an environment; None without one."""
+        episode = self.running.get(env_id) or self.idle.get(env_id)
+        return None if episode is None else episode.last_observation
+
+    def skip_unseen(self, env_id: Hashable, observation: Float[np.ndarray, "*agents observation"]) -> None:
+        """Learn nothing from the rest of an episode that stands at this observation, unless it is known already."""
+        if self.last_observation(env_id) is None:
+            self.idle[env_id] = RunningEpisode(last_observation=observation, is_abandoned=True)
+
     def drop(self, env_id: Hashable) -> None:
         """Abandon the running episode of an environment. Its steps stay stored, and are never learned from."""
         for episodes in (self.running, self.idle):

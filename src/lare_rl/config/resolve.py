@@ -163,9 +163,10 @@ def _check_size(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Non
         )
     if isinstance(resolved.hyperparameters, SequenceSettings):
         batch_size, rows = resolved.hyperparameters.batch_size, env.max_steps + 1
-        n_held = resolved.capacity // resolved.environments // rows * resolved.environments
+        # Each environment's running episode needs rows too.
+        n_held = max(0, (resolved.capacity // resolved.environments + 1) // rows - 1) * resolved.environments
         if n_held < batch_size:
-            enough = round_up(batch_size, resolved.environments) * rows
+            enough = (round_up(batch_size, resolved.environments) + resolved.environments) * rows
             raise LareError(
                 f"capacity = {resolved.capacity} holds {n_held} of the longest episodes of {task.name}, and an update reads {batch_size}: "
                 f"use a capacity of {enough} or more, or a smaller {resolved.algorithm}.batch_size"

@@ -54,6 +54,13 @@ class Credit(gymnasium.Wrapper, RecordConstructorArgs):
         gymnasium.Wrapper.__init__(self, env)
         check_pay(pay)
         _check_score(credit, score)
+        wrapped = env
+        while isinstance(wrapped, gymnasium.Wrapper):
+            if isinstance(wrapped, gymnasium.wrappers.Autoreset):
+                raise LareError(
+                    "the wrapper Autoreset resets within step, which is no step of an episode: put it around Credit"
+                )
+            wrapped = wrapped.env
         self.credit, self.pay, self.score = credit, pay, score
         self._recorder = StepRecorder(credit, env.observation_space, env.action_space, env_ids=[object()])
         self._observation: Any = None

@@ -93,6 +93,11 @@ class StepRecorder:
         config = self.credit.config
         return [info.get(config.group_key) for info in infos] if config.groups else None
 
+    def skip_unseen(self, env_index: int, observation: Any) -> None:
+        """See `CreditAssigner.skip_unseen`. `observation` is a batch, with a row for each environment."""
+        rows = self.layouts["observation"].rows(observation, "observation")
+        self.credit.skip_unseen(self.env_ids[env_index], rows[env_index])
+
     def drop(self, env_index: int) -> None:
         """Give up the running episode of an environment, which was reset."""
         self.credit.drop(self.env_ids[env_index])

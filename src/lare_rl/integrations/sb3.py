@@ -117,12 +117,16 @@ class CreditReplayBuffer(ReplayBuffer):
 
     def __getstate__(self) -> dict[str, Any]:
         state = {name: value for name, value in vars(self).items() if name not in ("_recorder", "rewards")}
-        return state | {"credit": self.credit.get_state(episodes=True)}
+        last_observations = [self.credit.last_observation(env_id) for env_id in self._recorder.env_ids]
+        return state | {"credit": self.credit.get_state(episodes=True), "last_observations": last_observations}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        credit = CreditAssigner.from_state(state.pop("credit"))
+        credit, last_observations = CreditAssigner.from_state(state.pop("credit")), state.pop("last_observations", ())
         vars(self).update(state)
         self._attach_assigner(credit)
+        for env_id, observation in zip(self._recorder.env_ids, last_observations, strict=False):
+            if observation is not None:  # running episodes are not saved: nothing is learned from the rest of them
+                credit.skip_unseen(env_id, observation)
 
 
 class CreditDictReplayBuffer(CreditReplayBuffer, DictReplayBuffer):
@@ -186,9 +190,12 @@ class CreditCallback(BaseCallback):
         self._recorder = StepRecorder(self.credit, self.model.observation_space, self.model.action_space, env_ids)
         self.step_ids: list[Int[np.ndarray, " environments"]] = []  # of the steps of this rollout
         starts: Any = self.model._last_episode_starts
-        for env_index in np.flatnonzero(starts).tolist():  # it was reset, or its episode has ended
-            self._recorder.drop(env_index)
         self._observation = self._original_observation(self.model._last_obs)
+        for env_index, starts_now in enumerate(starts.tolist()):
+            if starts_now:  # it was reset, or its episode has ended
+                self._recorder.drop(env_index)
+            else:
+                self._recorder.skip_unseen(env_index, self._observation)
         # r_hat must be added just before the algorithm computes advantages, where no callback is called. `on_rollout_end` comes after:
         # advantages could be computed again there, but MaskablePPO and RecurrentPPO do not give callbacks the last values.
         buffer.compute_returns_and_advantage = self._compute_returns_and_advantage
@@ -246,6 +253,6 @@ def _set_row(batch: Any, index: Any, element: Any) -> None:
     """Write an element into a batch, which is an array or a dictionary of arrays."""
     if isinstance(batch, dict):
         for key in batch:
-            batch[key][index] = element[key]
-    else:
-        batch[index] = element
+            _set_row(batch[key], index, element[key])
+    else:  # VecNormalize may return 9.999 for the whole number 10
+        batch[index] = np.rint(element) if batch.dtype.kind in "iu" else element

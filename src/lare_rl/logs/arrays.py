@@ -125,10 +125,11 @@ class FlatLog(ListLog):
         if both:
             raise LareError(f"flat arrays have {both[0]} and {D4RL_NAMES[both[0]]}: leave one of them out")
         flat = {D4RL_NAMES.get(key, key): _read_flat(key, value) for key, value in arrays.items()}
-        missing = [key for key in ("observations", "next_observations", "actions", "rewards") if key not in flat]
+        reward = "score" if "score" in flat else "rewards"
+        missing = [key for key in ("observations", "next_observations", "actions", reward) if key not in flat]
         if missing:
             raise LareError(
-                f"flat arrays need observations, next_observations, actions and rewards: {missing[0]} is missing"
+                f"flat arrays need observations, next_observations, actions, and rewards or score: {missing[0]} is missing"
             )
         flags = {key: to_array(flat[key], key).ravel() for key in D4RL_NAMES.values() if key in flat}  # (n, 1) too
         if not flags:
@@ -165,4 +166,6 @@ class _FlatEpisodes:
 
     def __iter__(self) -> Iterator[Mapping[str, np.ndarray]]:
         for start, end in zip([0, *self.ends], self.ends, strict=False):
-            yield {key: value[start:end] for key, value in self.arrays.items()}
+            episode = {key: value[start:end] for key, value in self.arrays.items()}
+            # Every row has the score, if there is one, and that of the last row counts.
+            yield episode | {"score": episode["score"][-1]} if "score" in episode else episode

@@ -92,15 +92,20 @@ class ParquetLog(TableLog):
 
     def read_batches(self) -> Iterator[pa.RecordBatch]:
         files = list_files(self.path, ".parquet") if self.path.is_dir() else [self.path]
-        schema = None
+        schema = last = None
         for file in files:
+            is_new = True
             try:
                 with pq.ParquetFile(file) as reader:
                     schema = schema or reader.schema_arrow
                     if reader.schema_arrow != schema:
                         column = _first_difference(schema, reader.schema_arrow)
                         raise LareError(f"{file} has other columns or types than {files[0]}, first {column}")
-                    yield from reader.iter_batches(batch_rows(schema))
+                    for batch in reader.iter_batches(batch_rows(schema)):
+                        if is_new and last is not None:
+                            _check_shard(file, last, batch)
+                        is_new, last = False, batch.slice(len(batch) - 1) if len(batch) else last
+                        yield batch
             except (OSError, pa.ArrowException, NotImplementedError) as error:
                 raise LareError(f"{file} is not a Parquet file, or damaged: {short_repr(error)}") from error
 
@@ -132,6 +137,22 @@ def _split_episodes(name: str, batch: pa.RecordBatch) -> Iterator[tuple[int | st
     starts = [0, *(np.flatnonzero(episode_ids[1:] != episode_ids[:-1]) + 1).tolist(), len(episode_ids)]
     for start, end in itertools.pairwise(starts):
         yield column[start].as_py(), batch.slice(start, end - start)
+
+
+def _check_shard(file: Path, last: pa.RecordBatch, batch: pa.RecordBatch) -> None:
+    """Raise `LareError` if a file continues the last episode of the file before by its number, and not by its observations.
+
+    `last` is the last row of the file before.
+    """
+    names = batch.schema.names
+    if not len(batch) or "episode" not in names or "next_observations" not in names:
+        return
+    row, next_row = ({name: rows.column(name)[0].as_py() for name in names} for rows in (last, batch))
+    if row["episode"] == next_row["episode"] and row["next_observations"] != next_row["observations"]:
+        raise LareError(
+            f"{file}: episode {row['episode']} also ends the file before, and does not begin here at its last observation: number the "
+            "episodes across files"
+        )
 
 
 def _check_columns(path: Path, schema: pa.Schema, row_is_episode: bool) -> None:

@@ -63,12 +63,20 @@ def _equal_returns(run: RunSummary) -> Finding | None:
 
 def _outcome(run: RunSummary) -> Finding:
     """Report whether the final policies are better than random actions and than the policies before training."""
-    std, seeds = sample_std(run.final_returns), Finding("over_seeds", {"n_seeds": run.n_seeds})
+    n_finite = len(run.final_returns)
+    over_seeds = Finding(
+        "over_seeds",
+        {
+            "n_finite": n_finite,
+            "of_all": None if n_finite == run.n_seeds else Finding("of_all", {"n_seeds": run.n_seeds}),
+        },
+    )
+    std = sample_std(run.final_returns)
     reached = {
         "return_": run.final_return,
         "std": Finding("std", {"std": std}) if std else None,
         "steps": int(run.steps[-1]),
-        "seeds": seeds if run.n_seeds > 1 else None,
+        "seeds": over_seeds if run.n_seeds > 1 else None,
         "deterministic": _deterministic(run),
     }
     if not len(run.random_returns):
@@ -108,7 +116,7 @@ def _episodic_comparison(run: RunSummary) -> Finding | None:
     difference, bound = run.final_return - return_, CLEAR_ERRORS * math.hypot(run.final_error, error)
     code = "like_episodic" if abs(difference) <= bound else "above_episodic" if difference > 0 else "below_episodic"
     best = None if name is None else Finding("best_episodic", {"name": name})
-    few_seeds = Finding("so_few_seeds") if min(run.n_seeds, n_seeds) < MIN_SEEDS else None
+    few_seeds = Finding("so_few_seeds") if min(len(run.final_returns), n_seeds) < MIN_SEEDS else None
     sampled = Finding("of_sampled_actions") if run.judges_deterministic else None
     episodic = Finding("episodic", {"return_": return_, "best": best})
     return Finding(code, {"episodic": episodic, "sampled": sampled, "few_seeds": few_seeds})

@@ -40,7 +40,8 @@ MESSAGES = {
         "evaluate --deterministic`)"
     ),
     "std": " ± {std:std}",
-    "over_seeds": " (mean over {n_seeds} seeds)",
+    "over_seeds": " (mean over {n_finite}{of_all} seeds)",
+    "of_all": " of {n_seeds}",
     "baseline": "random actions get {return_:number} ± {std:std} in {n_episodes:count episode}{initial}",
     "initial_policies": ", and before training it got {returns:number}",
     # The comparison with another run

@@ -80,7 +80,7 @@ def render_verdict(
         yield f'<p class="headline">{MESSAGES["no_evaluation"]}</p></div></div>'
         return
     yield f'<p class="headline">{escape(render_headline(summary))}</p>'
-    if reported.run.config.task.teams:
+    if len(reported.run.config.task.teams) > 1:
         yield render_note(f"Sentences and numbers are about the first team, {reported.run.config.task.roles[0].name}.")
     for subject, finding in diagnose(summary):
         if subject != "credit":
@@ -173,8 +173,8 @@ def _other_metrics(task: TaskSpec) -> Iterable[_Metric]:
 
 
 def _for_teams(metrics: Sequence[_Metric], task: TaskSpec) -> Sequence[_Metric]:
-    """Return the metrics of each team. Those of a task without teams are unchanged."""
-    if not task.teams:
+    """Return the metrics of each team. Those of a task with fewer than two teams are unchanged."""
+    if len(task.teams) < 2:
         return metrics
     return [
         _Metric(f"{name}_{team}", f"{title}, team of {team}", limits, std_name and f"{std_name}_{team}")

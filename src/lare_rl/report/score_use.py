@@ -27,6 +27,8 @@ class ScoreUse:
     window: int | None = None
     """The number of steps that a payment is for, if the task file names it."""
     has_groups: bool = False
+    """Whether episodes belong to groups, whose means are the baseline of the gain."""
+    has_intercepts: bool = False
     """Whether each group of episodes has its own intercept."""
     exact: str = "no"
     """How rewards are made to add up to the return: "no", "last" or "spread"."""
@@ -61,7 +63,7 @@ class ScoreUse:
             "form": Finding(self.form),
             "period": Finding(period_code, {"period": self.period}) if self.period else None,
             "window": Finding("paid_for", {"steps": self.window}) if self.window else None,
-            "groups": Finding("with_groups") if self.has_groups else None,
+            "groups": Finding("with_groups") if self.has_intercepts else None,
             "exact": None if self.exact == "no" else Finding(f"exact_{self.exact}"),
         }
         return Finding("score_use", how | {"trust": trust})
@@ -93,7 +95,8 @@ def summarise_score_use(
         period=None if task.payments == "end" else task.payments,
         window=task.payment_rule.window,
         has_groups=task.group is not None,
-        exact=settings.credit.exact,
+        has_intercepts=task.group is not None and method.fit is not Fit.SIGNS,
+        exact=settings.credit.exact if "exact" in method.settings else "no",
         equal_lengths=equal_lengths,
         gain=metrics["gain"],
         gain_error=metrics["gain_error"],

@@ -148,7 +148,8 @@ class HostCollector:
     def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
         """Restore the running episodes, by their seeds and actions.
 
-        If an observation differs in one bit, the environment is not deterministic: the episode is dropped, and a new one begins.
+        If the last observation differs in one bit, or an action is not available any more, the environment is not deterministic: the
+        episode is dropped, and a new one begins.
 
         Returns:
             Which episodes were dropped, and a message about each of them.
@@ -162,18 +163,21 @@ class HostCollector:
         idle = np.zeros(self._action_shape, np.float32)  # of environments that do not step
         with self._locate_errors():
             self._envs.reset(np.ones(len(indices), bool), self._episode_seeds())
-        ended_early = np.zeros(len(indices), bool)
+        differs = np.zeros(len(indices), bool)
         for t in range(max(map(len, actions))):
-            where = np.array([t < len(rows) for rows in actions]) & ~ended_early
+            where = np.array([t < len(rows) for rows in actions]) & ~differs
             for index in np.flatnonzero(where):
                 self._actions[index].append(actions[index][t])
             action_t = np.stack([rows[-1] if rows else idle for rows in self._actions])
+            if self._config.env.masks_actions:  # some environments fail if an action is not available
+                differs |= where & ~((action_t > 0) <= self._envs.batch.available).all(axis=(-1, -2))
+                where &= ~differs
             with self._locate_errors():
                 timestep = self._envs.step(action_t, where)
-            ended_early |= where & (timestep.terminated | timestep.truncated)
+            differs |= where & (timestep.terminated | timestep.truncated)
         self._episode_start = arrays["new"].copy()
         same = [np.array_equal(self._envs.batch.observation[i], arrays[f"observation{i}"]) for i in indices]
-        dropped = ended_early | ~np.array(same)
+        dropped = differs | ~np.array(same)
         messages = [
             f"{self._episode_name(index)} was dropped after {len(actions[index])} steps: "
             "the same actions did not lead to the same observation again"

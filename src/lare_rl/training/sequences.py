@@ -5,12 +5,13 @@ mean over its agents that are alive. The mixer's input is the global state or, w
 standardised by its running mean and deviation (PyMARL2 does not standardise it, because its environments return scaled states).
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Scalar
 
 from lare_rl.algorithms.batches import Metrics, Sequences
 from lare_rl.algorithms.registry import SequenceSettings
@@ -21,7 +22,7 @@ from lare_rl.data.layouts import lay_out_padded
 from lare_rl.data.replay import Replay
 from lare_rl.data.sampling import EpisodeSample, sample_distinct_episodes
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.interface import team_mean
+from lare_rl.envs.interface import EnvSpec, team_mean, with_available_action
 from lare_rl.nn.masks import select
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, standardise_unless_empty, update_mean_std
 from lare_rl.training.decoder_fits import fit_decoders, sample_credit
@@ -190,13 +191,22 @@ def _sequences(
 
     observation = all_timesteps("observation")
     state = all_timesteps("state") if config.env.state_size else jnp.zeros((*observation.shape[:2], 0))
-    n_choices = (*observation.shape[:-1], config.env.action_size)
     return Sequences(
         observation=observation,
         state=standardise_unless_empty(mixer_statistics, _mixer_input(observation, state, config)),
-        available=all_timesteps("available") if config.env.masks_actions else jnp.ones(n_choices, bool),
+        available=_available_actions(all_timesteps, observation.shape[:-1], config.env),
         action=steps.columns["action"],
         reward=mask * team_mean(reward, alive_agents(steps, config), config.env.teams[0]),
         done=episodes.mask[:, None] * (jnp.arange(n_steps) == episodes.length[:, None] - 1),
         mask=mask,
     )
+
+
+def _available_actions(
+    all_timesteps: Callable[[str], Array], shape: tuple[int, ...], env: EnvSpec
+) -> Bool[Array, "episodes time_steps agents action"]:
+    """Return the available actions of agents at some time steps of this shape. One that has left can only choose the first action."""
+    if env.masks_actions:
+        return all_timesteps("available")
+    available = jnp.ones((*shape, env.action_size), bool)
+    return with_available_action(available & all_timesteps("alive")[..., None]) if env.agents_leave else available

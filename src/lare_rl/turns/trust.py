@@ -23,7 +23,7 @@ from lare_rl.turns.features import TurnTable
 from lare_rl.turns.regression import fit_linear
 from lare_rl.turns.words import count_decimals
 from lare_rl.util.findings import Finding
-from lare_rl.util.statistics import CLEAR_ERRORS, ratio_of_sums
+from lare_rl.util.statistics import CLEAR_ERRORS, CONSTANT, ratio_of_sums
 
 __all__ = [
     "GRPO",
@@ -96,7 +96,10 @@ def measure_errors(table: TurnTable, held_out: Float[np.ndarray, " turns"]) -> E
 def summarise(errors: Sequence[Errors]) -> Trust:
     """Return the trust in values from the errors of the latest calls."""
     calls = Errors(*(np.concatenate(arrays) for arrays in zip(*errors, strict=True)))
-    is_measured = len(calls.baseline) >= MIN_ROLLOUTS and calls.baseline.sum() > 0
+    varies = (
+        calls.baseline.sum() > CONSTANT * len(calls.outcome) * calls.outcome.var()
+    )  # within groups, by more than rounding errors
+    is_measured = len(calls.baseline) >= MIN_ROLLOUTS and varies
     gain, gain_error = ratio_of_sums(calls.reduction, calls.baseline) if is_measured else (math.nan, math.nan)
     return Trust(
         gain=gain,

@@ -73,7 +73,8 @@ def posterior_stds(
     change = np.diff(rows, axis=0, append=0)
     change[last] = rows[last]
     variance = np.sum((change @ fit.root.T) ** 2, axis=1)
-    variance[last] += 1 / fit.group_precision[table.group]  # b cancels in the other changes
+    if fit.root.any():  # the outcomes differ
+        variance[last] += 1 / fit.group_precision[table.group]  # b cancels in the other changes
     return np.sqrt(variance)
 
 

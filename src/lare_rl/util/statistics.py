@@ -84,10 +84,14 @@ def round_shares(shares: Sequence[float], total: float = 1.0) -> list[float]:
 
 def correlation(x: Float[np.ndarray, " values"], y: Float[np.ndarray, " values"]) -> float:
     """Return Pearson's correlation, or NaN for fewer than two values, or if one of the two never varies."""
-    if len(x) < 2:
+    if len(x) < 2 or not (_varies(x) and _varies(y)):
         return math.nan
     with np.errstate(invalid="ignore"):
         return float(np.corrcoef(x, y)[0, 1])
+
+
+def _varies(values: Float[np.ndarray, " values"]) -> bool:
+    return bool(np.sum((values - values.mean()) ** 2) > CONSTANT * np.sum(values**2))
 
 
 def column_correlations(
@@ -105,7 +109,7 @@ def r_squared(y: Float[np.ndarray, " values"], predicted: Float[np.ndarray, " va
     if len(y) < 2:
         return math.nan, math.nan
     errors, deviations = (y - predicted) ** 2, (y - y.mean()) ** 2
-    if not deviations.sum() > CONSTANT * np.sum(y**2):
+    if not _varies(y):
         return math.nan, math.nan
     ratio, error = ratio_of_sums(errors, deviations)
     return 1 - ratio, error
