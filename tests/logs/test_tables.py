@@ -183,6 +183,15 @@ def test_files_that_count_their_episodes_from_0(tmp_path):
         list(open_log(tmp_path).episodes())
 
 
+def test_files_of_whole_episodes_may_all_count_from_0(tmp_path):
+    rows = episode_rows(logged_episodes(1)).append_column("episode", pa.array([0]))
+    rows = rows.append_column("next_observations", rows["observations"])
+    for name in "ab":
+        pq.write_table(rows, tmp_path / f"{name}.parquet")
+    log = open_log(tmp_path)
+    assert sum(1 for _ in log.read()) == 2
+
+
 def test_texts_of_any_type(tmp_path):
     """polars writes large strings, pandas dictionaries. A table of episodes may have a column of their ids."""
     path = tmp_path / "log.parquet"

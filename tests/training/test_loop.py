@@ -84,7 +84,7 @@ def test_every_listener_is_stopped(tmp_path, monkeypatch):
     session = EmptySession(tmp_path)
     monkeypatch.setattr(training, "start_session", lambda run: session)
     with pytest.raises(OSError, match="disk full"):
-        training._finish(session.run, False, listeners, threading.Event(), [], 36)
+        training._run_to_end(session.run, False, listeners, threading.Event(), [], 36)
     assert session.is_closed
     assert [listener.n_stops for listener in listeners] == [1, 1, 1]
 

@@ -81,6 +81,17 @@ def test_one_rollout_and_equal_outcomes_get_no_advantage():
         assert not np.concatenate([*result.advantage, *result.progress]).any()
 
 
+def test_equal_outcomes_within_groups_say_nothing_of_the_values():
+    rng = np.random.default_rng(0)
+    for n_groups in (2, 5):
+        rollouts = [
+            {"turns": [{"a": int(rng.integers(2))}] * 3, "outcome": 0.1 + 0.6 * (group % 2), "group": f"task {group}"}
+            for group in range(n_groups)
+            for _ in range(10)
+        ]
+        assert lare_rl.TurnCredit()(rollouts).reason.code == "unknown"
+
+
 @pytest.mark.parametrize(
     ("gain", "surprise", "lambda_", "code"),
     [

@@ -10,6 +10,8 @@ from lare_rl.util.renamed_fields import rename_fields, rename_keys, rename_optio
     [
         (".credit[0].closed.summed.episodes", ".decoders[0].closed_form.sufficient_statistics.n_episodes"),
         (".credit[0].decoder.step", ".decoders[0].network.position"),
+        (".credit[0].decoder.number", ".decoders[0].network.index_embeddings"),
+        (".decoders[0].optimizer[0].mu.agent_numbers", ".decoders[0].optimizer[0].mu.index_embeddings"),
         (".credit[0].decoder.step.layers[0].weight", ".decoders[0].network.step_model.layers[0].weight"),
         (".decoders[0].decoder.network.layers[0].bias", ".decoders[0].network.mlp.layers[0].bias"),
         ("[0].decoder.decoder.network.layers[0].bias", "[0].network.step_decoder.mlp.layers[0].bias"),

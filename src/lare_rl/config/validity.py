@@ -60,7 +60,10 @@ def _find_problems(spec: CreditSpec, n_agents: int, discrete_actions: bool) -> I
     n_raw = spec.basis.n_raw
     has_no_fit = n_raw > MAX_RAW_FEATURES and not spec.basis.n_features
     if settings.score == "average" and "score" in method.settings and has_no_fit and not spec.fixed_length:
-        yield f"{name} needs a closed-form fit for an average, which reads at most {MAX_RAW_FEATURES} raw features; there are {n_raw}"
+        yield (
+            f"{name} needs a fit in closed form for an average, which reads at most {MAX_RAW_FEATURES} raw features, and the task has "
+            f"{n_raw}: use a method with phi, such as lare-bayes"
+        )
     if method.fit in (Fit.EVIDENCE, Fit.PREFIX_EVIDENCE) and not method.needs_phi and n_raw > MAX_RAW_FEATURES:
         yield (
             f"{name} fits a weight to each of at most {MAX_RAW_FEATURES} raw features, and the task has {n_raw}: use lare-bayes, "

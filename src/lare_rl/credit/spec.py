@@ -50,7 +50,7 @@ class CreditSpec:
     @property
     def n_assessed(self) -> int:
         """The number of last returns (or payments) over which R^2 and gain are computed (`prequential.py`)."""
-        return SEGMENT_WINDOW if self.payments.pays_early or self.settings.score == "binary" else WINDOW
+        return WINDOW if self.payments.only_at_end and self.settings.score != "binary" else SEGMENT_WINDOW
 
     @property
     def n_levels(self) -> int:

@@ -149,7 +149,10 @@ def make_local_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
 
 def picklable_maker(task: TaskSpec) -> Callable[[], HostEnv]:
     """Return a picklable function. In another process, it imports the module of the family's maker, then makes the environment."""
-    return partial(_import_and_make, find_family(task), task)
+    family = find_family(task)
+    if not isinstance(maker := family.maker, str):  # a function of a module; functions themselves may not be picklable
+        family = family._replace(maker=f"{maker.__module__}:{getattr(maker, '__qualname__', '')}")
+    return partial(_import_and_make, family, task)
 
 
 def _import_and_make(family: Family, task: TaskSpec) -> HostEnv:

@@ -45,7 +45,9 @@ def add_function(function: Callable[[dict[str, Any]], Any], arrays: dict[str, Ar
     try:
         # "NumPy" means NumPy's names here: the functions add nodes. All inputs are the first argument; there are no others.
         return to_numpy(function, shapes, array_functions=_find_function)(arrays)()
-    except (UnsupportedOperationError, RefusedError) as error:
+    except RefusedError as error:
+        raise LareError(f"a function of this run cannot be exported: {one_line(error)}{hint}") from error
+    except UnsupportedOperationError as error:
         raise LareError(
             f"a function of this run cannot be exported, because its operation {one_line(error)!r} is not translated{hint}"
         ) from error

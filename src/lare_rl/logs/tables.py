@@ -145,14 +145,27 @@ def _check_shard(file: Path, last: pa.RecordBatch, batch: pa.RecordBatch) -> Non
     `last` is the last row of the file before.
     """
     names = batch.schema.names
-    if not len(batch) or "episode" not in names or "next_observations" not in names:
+    if (
+        not len(batch)
+        or not {"episode", "observations", "next_observations"} <= set(names)
+        or _rows_are_episodes(batch.schema)
+    ):
         return
     row, next_row = ({name: rows.column(name)[0].as_py() for name in names} for rows in (last, batch))
-    if row["episode"] == next_row["episode"] and row["next_observations"] != next_row["observations"]:
+    ends = (np.asarray(values, object) for values in (row["next_observations"], next_row["observations"]))
+    if row["episode"] == next_row["episode"] and not _are_equal(*ends):
         raise LareError(
             f"{file}: episode {row['episode']} also ends the file before, and does not begin here at its last observation: number the "
             "episodes across files"
         )
+
+
+def _are_equal(a: np.ndarray, b: np.ndarray) -> bool:
+    """Return whether observations are equal as numbers of float32. Their columns may have different types."""
+    try:
+        return np.array_equal(a.astype(np.float32), b.astype(np.float32))
+    except (TypeError, ValueError):  # not numbers, which is reported where they are read
+        return True
 
 
 def _check_columns(path: Path, schema: pa.Schema, row_is_episode: bool) -> None:

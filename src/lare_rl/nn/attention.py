@@ -47,7 +47,7 @@ def attend(
 
     scores = jax.lax.batch_matmul(by_head(query), jnp.swapaxes(by_head(key), 1, 2)) / jnp.sqrt(size)
     if mask is not None:
-        scores = jnp.where(mask, scores if mask.ndim == 2 else scores[:, None], -1e9)
+        scores = jnp.where(mask, jnp.expand_dims(scores, range(1, mask.ndim - 1)), -1e9)
     weights = transform(jax.nn.softmax(scores))
     output = jax.lax.batch_matmul(weights.reshape(len(scores), -1, weights.shape[-1]), by_head(value))
     by_query = jnp.swapaxes(output.reshape(*batch, heads, -1, size), -2, -3)

@@ -44,7 +44,7 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
     "Methods with proxy rewards": {
         RETURN_R2: (
             "R² of the last 32 returns, each predicted before the decoder was fitted to it; of the last 256 if an episode has several "
-            "payments, or is won or lost. Null until 8 are predicted."
+            "payments, is paid for its last steps alone, or is won or lost. Null until 8 are predicted."
         ),
         "credit/gain": "Share of the squared error of the level's mean return that these predictions remove.",
         "credit/gain_error": "Standard error of `credit/gain`.",

@@ -96,9 +96,7 @@ def measure_errors(table: TurnTable, held_out: Float[np.ndarray, " turns"]) -> E
 def summarise(errors: Sequence[Errors]) -> Trust:
     """Return the trust in values from the errors of the latest calls."""
     calls = Errors(*(np.concatenate(arrays) for arrays in zip(*errors, strict=True)))
-    varies = (
-        calls.baseline.sum() > CONSTANT * len(calls.outcome) * calls.outcome.var()
-    )  # within groups, by more than rounding errors
+    varies = calls.baseline.sum() > CONSTANT * np.sum(calls.outcome**2)  # within groups, by more than rounding errors
     is_measured = len(calls.baseline) >= MIN_ROLLOUTS and varies
     gain, gain_error = ratio_of_sums(calls.reduction, calls.baseline) if is_measured else (math.nan, math.nan)
     return Trust(

@@ -88,7 +88,7 @@ class Registry(Mapping[str, T], Generic[T]):
         try:
             return find_named(self._kind, self._kinds, name, self._values)
         except LareError as error:
-            hint = f"; for a {self._kind} of a plugin, name the plugin's module in LARE_PLUGINS"
+            hint = "; if a plugin has it, name the plugin's module in LARE_PLUGINS"
             raise LareError(f"{error}{'' if read_variable('LARE_PLUGINS') else hint}") from None
 
     def __getitem__(self, name: str) -> T:

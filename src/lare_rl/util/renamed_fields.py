@@ -72,7 +72,7 @@ _RENAMED_PATHS = {
     rf"{_NETWORK}\.network\b": r"\1.mlp",
     rf"{_NETWORK}\.decoder\.network\b": r"\1.step_decoder.mlp",
     rf"{_NETWORK}\.step$": r"\1.position",  # STAS
-    rf"{_NETWORK}\.(agent_)?number$": r"\1.index_embeddings",
+    rf"{_NETWORK}\.(agent_)?numbers?$": r"\1.index_embeddings",
     rf"{_NETWORK}\.last(?=\.(weight|bias)$)": r"\1.head",
     rf"{_NETWORK}\.value\.": r"\1.readout.",  # Diaster
     rf"{_NETWORK}\.step\.": r"\1.step_model.",
