@@ -135,7 +135,7 @@ COMPARISONS = {
     ),
     f"{WALKER}, TD3": sweep("published", WALKER, "rrdu", "lrr", "grd", "rudder"),
     "Hopper-v5, TD3": sweep("unseen", "Hopper-v5", "rrdu", "lrr"),
-    "Ant-v5, TD3": sweep("unseen", "Ant-v5", "rrdu"),
+    "Ant-v5, TD3": sweep("unseen", "Ant-v5", "rrdu", "lrr"),
     "Reacher-v4, TD3": sweep("headline", "Reacher-v4", "rrdu"),
     "HalfCheetahTarget-v4, TD3": sweep("headline", "HalfCheetahTarget-v4", "rrdu"),
     "HalfCheetahThreshold-v4, TD3": score_study(
