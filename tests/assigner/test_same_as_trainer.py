@@ -93,7 +93,7 @@ EVERY_5, WINDOW = PaymentRule(period=5), PaymentRule(period=4, window=6)
         long_case(
             "lare-bayes-history", PHI_ENV, {"score": "auto", "payments": EVERY_5, "exact": "spread", "n_running": 4}
         ),
-        long_case("bayes-progress", ONE_TEAM, {"exact": "spread"}),
+        long_case("bayes-progress", replace(ONE_TEAM, agents_leave=False), {"exact": "spread"}),
         long_case("bayes-progress", ONE_AGENT, {"exact": "last", "n_running": 11}),
         long_case("bayes", ONE_AGENT, {"score": "binary", "group": "map"}),
         long_case("rd-linear", ONE_AGENT, {"group": "map", "score": "auto"}),
