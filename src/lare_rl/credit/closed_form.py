@@ -253,9 +253,8 @@ def _centre_average(state: ClosedForm, weights: _Weights, index: int) -> _Weight
     an episode learns to end it, although this does not raise the average.
     """
     n_features, step_mean = state.decoder.basis.n_features, to_float64(state.sufficient_statistics).mean
-    mean = (
-        weights.bias[index] + weights.weight[index, :n_features] @ step_mean[:n_features]
-    )  # without the intercepts of levels
+    # The intercepts of levels are left out: no step is paid for them.
+    mean = weights.bias[index] + weights.weight[index, :n_features] @ step_mean[:n_features]
     bias, start_value = weights.bias.at[index].add(-mean), weights.start_value.at[index].add(mean)
     return weights._replace(bias=bias, start_value=start_value)
 

@@ -125,7 +125,7 @@ class Timestep(NamedTuple):
     available: Bool[AnyArray, "*batch agents action"]
     """The available actions of each agent: at least one, even for an agent that has left. All true for continuous actions."""
     alive: Bool[AnyArray, "*batch agents"]
-    """Which agents act now. At an episode's last step: which of those that acted observe the result."""
+    """Which agents act now. At an episode's last step: which agents observe the result."""
     reward: Float[AnyArray, "*batch agents"]
     """The rewards of this step. Agents that were not alive before it receive 0, and so do all agents after `reset`."""
     terminated: Bool[AnyArray, "*batch"]

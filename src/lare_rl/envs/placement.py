@@ -101,8 +101,8 @@ def load_env_spec(task: TaskSpec) -> EnvSpec:
 def make_vec_env(task: TaskSpec, n: int, parallel: bool = False) -> VecEnv:
     """Make `n` environments of a task: each in its own process if it needs that, else where they step fastest.
 
-    Environments that workers cannot make, such as those that the user's script registers, stay in this process. If `parallel`, worker
-    processes are used even if they are not faster, and `LareError` is raised if they cannot make the environments.
+    If workers cannot make the environments, for instance because the user's script registers them, they stay in this process. If
+    `parallel`, worker processes are used even if they are not faster, and `LareError` is raised if they cannot make the environments.
     """
     if needs_process(task):
         return _make_separate(task, n)

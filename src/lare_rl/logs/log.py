@@ -125,9 +125,8 @@ def atomic_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> I
         with report_write_error(out, "; existing data are unchanged"):
             yield new
             check_output(out, overwrite, folders)
-            if out.is_dir() or (
-                out.exists() and new.is_dir()
-            ):  # no single call replaces a directory, or a file by a directory
+            # No single call replaces a directory, or a file by a directory.
+            if out.is_dir() or (out.exists() and new.is_dir()):
                 out.rename(old)
             new.replace(out)
     finally:

@@ -144,12 +144,8 @@ def _check_shard(file: Path, last: pa.RecordBatch, batch: pa.RecordBatch) -> Non
 
     `last` is the last row of the file before.
     """
-    names = batch.schema.names
-    if (
-        not len(batch)
-        or not {"episode", "observations", "next_observations"} <= set(names)
-        or _rows_are_episodes(batch.schema)
-    ):
+    names = {"episode", "observations", "next_observations"}
+    if not len(batch) or not names <= set(batch.schema.names) or _rows_are_episodes(batch.schema):
         return
     row, next_row = ({name: rows.column(name)[0].as_py() for name in names} for rows in (last, batch))
     ends = (np.asarray(values, object) for values in (row["next_observations"], next_row["observations"]))

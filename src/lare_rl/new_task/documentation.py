@@ -121,9 +121,8 @@ def plain_lines(text: str) -> list[str]:
 
 def _remove_markup(line: str) -> str:
     line = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", line)
-    line = re.sub(
-        r"(`[^`]*`)|\*\*(?=\S)(.+?)(?<=\S)\*\*", lambda match: match[1] or match[2], line
-    )  # a power in code stays
+    # A power in code, such as `x**2`, stays.
+    line = re.sub(r"(`[^`]*`)|\*\*(?=\S)(.+?)(?<=\S)\*\*", lambda match: match[1] or match[2], line)
     line = line.replace("`", "").strip()
     return re.sub(r"\$?\\?[a-z]*\{?\\infty\}?\$?", "inf", line)
 
