@@ -1,5 +1,6 @@
 """What is no log is refused, and a log is written completely or not at all."""
 
+import os
 import sys
 
 import numpy as np
@@ -47,10 +48,14 @@ def test_output_after_a_killed_process(tmp_path):
     for name in (new, old, *unrelated):
         (tmp_path / name).mkdir()
     (tmp_path / old / "0.npz").write_text("the old data")
+    recent = f".log.{'3' * 32}.new"  # a living process may write it
+    (tmp_path / recent).mkdir()
+    for path in (tmp_path / new, tmp_path / old / "0.npz", tmp_path / old):
+        os.utime(path, (0, 0))
     with pytest.raises(LareError, match="log exists"), atomic_output(tmp_path / "log", False):
         pass
     assert (tmp_path / "log" / "0.npz").read_text() == "the old data"
     with atomic_output(tmp_path / "log", True) as new:
         new.write_text("new")
     assert (tmp_path / "log").read_text() == "new"
-    assert sorted(path.name for path in tmp_path.iterdir()) == [*unrelated, "log"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [recent, *unrelated, "log"]

@@ -25,7 +25,7 @@ BINARY = ScoreUse(form="form_log_odds", is_binary=True, gain_error=0.1)
 def find(returns, **facts):
     """The findings, by code."""
     returns = np.asarray(returns, float)
-    summary = {"steps": STEPS[: returns.shape[1]], "returns": returns, "random_returns": RANDOM, "directory": "runs/x"}
+    summary = {"steps": STEPS[: returns.shape[1]], "returns": returns, "random_returns": RANDOM, "evaluate": "EVALUATE"}
     return {finding.code: finding for _, finding in diagnose(RunSummary(**(summary | facts)))}
 
 
@@ -148,7 +148,7 @@ def test_best_evaluation():
     assert find(FELL, warmup=4000)["has_fallen"].values["return_"] == 60
     returns = np.array([[0.0, 20, 60, 50, 88, 60, 85, 60]])
     best = find(returns, task="mine.toml")["needs_baseline"].values["best"]
-    assert best.values == {"step": 5000, "return_": 88, "directory": "runs/x"}
+    assert best.values == {"step": 5000, "return_": 88, "evaluate": "EVALUATE"}
     assert find(LEVEL, task="mine.toml")["needs_baseline"].values["best"] is None
 
 

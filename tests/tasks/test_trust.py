@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -166,10 +167,11 @@ def test_every_folder_of_a_namespace_is_checked(write_run, tmp_path, monkeypatch
 def test_module_that_a_new_process_would_not_trust(monkeypatch):
     task = toy_spec(environment="helpers.toy_envs:toys/Chase-v0")
     trust.trust_environment(task)
-    assert trust.trust_prefix(task) == "LARE_TRUST=helpers.toy_envs "
-    assert trust.trust_prefix(toy_spec(environment="Pendulum-v1")) == ""
+    arguments = "report", Path("a run")
+    assert trust.command_line(task, *arguments) == "LARE_TRUST=helpers.toy_envs lare-rl report 'a run'"
+    assert trust.command_line(toy_spec(environment="Pendulum-v1"), *arguments) == "lare-rl report 'a run'"
     monkeypatch.setenv("LARE_TRUST", "helpers.toy_envs")
-    assert trust.trust_prefix(task) == ""
+    assert trust.command_line(task, *arguments) == "lare-rl report 'a run'"
 
 
 def test_train_ends_with_a_command_that_can_be_copied(write_run, command, monkeypatch):

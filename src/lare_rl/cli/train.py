@@ -1,6 +1,5 @@
 """The command `train`."""
 
-import shlex
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,7 +14,7 @@ from lare_rl.config.effective import describe_unused_settings
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.errors import LareError
 from lare_rl.runs.plan import RunPlan, load_config
-from lare_rl.tasks.trust import trust_prefix
+from lare_rl.tasks.trust import command_line
 
 if TYPE_CHECKING:
     from lare_rl.latent.function import LatentFunction
@@ -90,9 +89,7 @@ def train(
     else:
         start, run_settings = _prepare(chosen_task, settings, function, out or plan.out, plan)
     run = start(tensorboard=tensorboard, listeners=_listeners(wandb, mlflow, run_settings))
-    print_line(
-        f"finished {run.directory}; to see it: {trust_prefix(run.config.task)}lare-rl report {shlex.quote(str(run.directory))}"
-    )
+    print_line(f"finished {run.directory}; to see it: {command_line(run.config.task, 'report', run.directory)}")
 
 
 def _prepare(

@@ -27,9 +27,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput
-from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, is_step
+from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode
 from lare_rl.credit.spec import CreditSpec
-from lare_rl.nn.masks import masked_mean
+from lare_rl.nn.masks import masked_mean, step_mask
 from lare_rl.nn.networks import MLP, bound_log_std
 
 __all__ = ["GRD", "causes", "sample_mask"]
@@ -126,7 +126,7 @@ class GRD(eqx.Module):
         """Return the loss. The arguments are those of `Diaster.loss`. `key` is also for the steps whose next states are predicted."""
         keys = jax.random.split(key, 5)
         lambda_sr, lambda_ar, lambda_ss, lambda_ii, lambda_as = self.sparsity
-        valid = is_step(length, inputs.shape[1]) & (mask > 0)[:, None]
+        valid = step_mask(length, inputs.shape[1]) & (mask > 0)[:, None]
         r_hat = self._reward(inputs, sample_mask(self.state_reward, keys[0]), sample_mask(self.action_reward, keys[1]))
         error = jnp.sum(valid * r_hat, axis=1) / jnp.maximum(length, 1) - target
         reward_loss = masked_mean(error**2, mask)

@@ -9,9 +9,9 @@ The target is R/T, as in LaRe's published code. With `sum_form`, each squared er
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from lare_rl.nn.masks import masked_mean
+from lare_rl.nn.masks import masked_mean, step_mask
 from lare_rl.nn.networks import MLP
 
 __all__ = [
@@ -20,7 +20,6 @@ __all__ = [
     "PerEpisode",
     "episode_means",
     "episode_weight",
-    "is_step",
     "leave_one_out_nll",
     "mean_over_episodes",
     "squared_error",
@@ -97,11 +96,6 @@ def episode_weight(length: Int[Array, " episodes"], mask: PerEpisode, sum_form: 
     return mask * length.astype(jnp.float32) ** 2 if sum_form else mask
 
 
-def is_step(length: EpisodeLengths, n_rows: int) -> Bool[Array, "episodes steps"]:
-    """Return which rows are steps of the episodes. The others are padding."""
-    return jnp.arange(n_rows) < length[:, None]
-
-
 def step_loss(
     step_model: MLP, inputs: EpisodeInputs, prefix_returns: Float[Array, "episodes steps"], length: EpisodeLengths
 ) -> Float[Array, " episodes"]:
@@ -119,4 +113,4 @@ def step_loss(
     n_rows = inputs.shape[1]
     target = n_rows * jnp.diff(jax.lax.stop_gradient(prefix_returns), axis=1, prepend=0)
     squared_error = (step_model(inputs)[..., 0] - target) ** 2
-    return jnp.sum(is_step(length, n_rows) * squared_error, axis=1) / jnp.maximum(length, 1)
+    return jnp.sum(step_mask(length, n_rows) * squared_error, axis=1) / jnp.maximum(length, 1)

@@ -22,11 +22,11 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput, split_key
 from lare_rl.credit.decoders import RBT_STEPS
-from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, is_step, step_loss
+from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, step_loss
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.dropout import dropout
-from lare_rl.nn.masks import masked_mean
+from lare_rl.nn.masks import masked_mean, step_mask
 from lare_rl.nn.networks import MLP, Linear
 
 __all__ = ["RBT", "Block"]
@@ -135,7 +135,7 @@ class RBT(eqx.Module):
         """
         max_steps, n_steps = inputs.shape[1], jnp.maximum(length, 1)
         assert max_steps <= RBT_STEPS
-        valid = is_step(length, max_steps)
+        valid = step_mask(length, max_steps)
         reward, next_state = self.bag_rewards(inputs, valid, key)
         reward = valid * reward
         reward_loss = (jnp.sum(reward, axis=1) - target * length) ** 2 / n_steps

@@ -23,9 +23,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput
-from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, is_step, step_loss
+from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, step_loss
 from lare_rl.credit.spec import CreditSpec
-from lare_rl.nn.masks import masked_mean
+from lare_rl.nn.masks import masked_mean, step_mask
 from lare_rl.nn.networks import MLP, Linear
 
 __all__ = ["RUDDER"]
@@ -87,7 +87,7 @@ class RUDDER(eqx.Module):
         total = target * length / max_steps  # R in the unit of g
         g = self.predictions(inputs)
         last = jnp.take_along_axis(g, n_steps[:, None] - 1, axis=1)[:, 0]
-        squared_error = is_step(length, max_steps) * (g - total[:, None]) ** 2
+        squared_error = step_mask(length, max_steps) * (g - total[:, None]) ** 2
         return_loss = (last - total) ** 2 + CONTINUOUS_WEIGHT * jnp.sum(squared_error, axis=1) / n_steps
         share = jnp.arange(1, max_steps + 1) / n_steps[:, None]
         prefix = g + share * (total - last)[:, None]

@@ -3,6 +3,7 @@
 import contextlib
 import glob
 import shutil
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -20,6 +21,8 @@ _Item = TypeVar("_Item")
 
 BATCH_STEPS = 8192
 """Steps at a time: at least this many are computed or written, and at most this many rows of steps are read."""
+ABANDONED_S = 3600.0
+"""Incomplete output that was not changed for this time (s) is what a killed process has left."""
 LOG_SUFFIXES = frozenset({".npz", ".parquet", ".arrow", ".json"})
 """Files of logs. A directory with other files is never replaced."""
 
@@ -137,13 +140,19 @@ def atomic_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> I
 
 
 def _clean_up(out: Path) -> None:
-    """Put back the data that a killed process had moved away, and remove what it had written so far."""
+    """Put back the data that a killed process had moved away, and remove what it wrote, if it is an hour old: others may be writing."""
     with contextlib.suppress(OSError):
         for path in out.parent.glob(f".{glob.escape(out.name)}.{'[0-9a-f]' * 32}.*"):  # not those of `OUT.b`
             if path.suffix == ".old" and not out.exists():
                 path.rename(out)
-            elif path.suffix in (".old", ".new"):
+            elif path.suffix in (".old", ".new") and _is_abandoned(path):
                 _remove(path)
+
+
+def _is_abandoned(path: Path) -> bool:
+    """Return whether nothing in `path` was changed for so long that no living process writes it."""
+    changed = max(file.stat().st_mtime for file in (path, *path.rglob("*")))
+    return time.time() - changed > ABANDONED_S
 
 
 def _remove(path: Path) -> None:

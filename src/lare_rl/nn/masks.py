@@ -1,12 +1,12 @@
-"""Means and choices by a mask."""
+"""Masks, and means and choices by them."""
 
 from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Num
+from jaxtyping import Array, Bool, Float, Int, Num
 
-__all__ = ["masked_mean", "select"]
+__all__ = ["masked_mean", "select", "step_mask"]
 
 Tree = TypeVar("Tree")
 
@@ -19,6 +19,11 @@ def masked_mean(
     `mask` is 0 or 1. Where it is 0, x must be finite.
     """
     return jnp.mean(x) if mask is None else jnp.sum(x * mask) / jnp.maximum(jnp.sum(mask), 1)
+
+
+def step_mask(length: Int[Array, " episodes"], n_rows: int) -> Bool[Array, "episodes {n_rows}"]:
+    """Return which rows are steps of the episodes. The others are padding."""
+    return jnp.arange(n_rows) < length[:, None]
 
 
 def select(mask: Bool[Array, "*lead"], new: Tree, old: Tree) -> Tree:

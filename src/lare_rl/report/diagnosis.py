@@ -174,9 +174,9 @@ def _is_rising(run: RunSummary) -> Finding | None:
     quarter = run.finite_means[-max(2, len(run.finite_means) // 4) :]
     if last - previous <= max(change, run.final_error) or quarter[-1] - quarter[0] <= change / 2:
         return None
-    step, values = int(run.steps[-1]), {"directory": run.directory}
-    longer = Finding("resume_longer", values | {"steps": 2 * step})
-    return Finding("is_rising", {"command": Finding("resume", values) if step < run.planned_steps else longer})
+    step = int(run.steps[-1])
+    more_steps = "" if step < run.planned_steps else f" --steps {2 * step}"
+    return Finding("is_rising", {"command": f"{run.resume}{more_steps}"})
 
 
 def _one_seed_was_better(run: RunSummary) -> Finding | None:
@@ -188,7 +188,7 @@ def _one_seed_was_better(run: RunSummary) -> Finding | None:
     return_ = float(trained_returns[seed_index, best])
     if return_ <= run.random_mean + EVALUATION_STDS * run.random_std or not run.has_best_policy:
         return None
-    values = {"step": int(run.steps[best]), "return_": return_, "directory": run.directory}
+    values = {"step": int(run.steps[best]), "return_": return_, "evaluate": run.evaluate}
     return Finding("one_seed_was_better", values)
 
 
@@ -204,7 +204,7 @@ def _has_fallen(run: RunSummary) -> Finding | None:
     error = math.sqrt(2) * run.final_error  # of a difference between two returns with equal errors
     if best - last <= max(FALL_FRACTION * abs(best - start), 2 * change, CLEAR_ERRORS * error):
         return None
-    return Finding("has_fallen", {"step": step, "return_": best, "directory": run.directory})
+    return Finding("has_fallen", {"step": step, "return_": best, "evaluate": run.evaluate})
 
 
 def _is_stuck(run: RunSummary) -> Finding | None:
@@ -224,7 +224,7 @@ def _needs_training(run: RunSummary) -> Finding | None:
     """Recommend more training for a policy that has not learned, and say if credit is not what limits it."""
     if not len(run.random_returns) or run.has_learned:
         return None
-    values: dict[str, Any] = {"limit": None, "evaluate": None, "phi": None, "directory": run.directory}
+    values: dict[str, Any] = {"limit": None, "check": None, "phi": None, "resume": run.resume}
     if (run.return_r2 or 0) > HIGH_R2:
         agents, rule = Finding("among_agents"), Finding("own_rule")
         limit = {"agents": agents if run.many_agents else None, "rule": rule if run.is_own_task else None}
@@ -232,7 +232,7 @@ def _needs_training(run: RunSummary) -> Finding | None:
         if not run.sees_factors:
             values["phi"] = Finding("products_need_phi", {"n_features": MAX_PAIRED_RAW_FEATURES, "task": run.task})
     if run.may_have_learned and not run.beats_random():
-        values["evaluate"] = Finding("evaluate_more", {"directory": run.directory})
+        values["check"] = Finding("evaluate_more", {"evaluate": run.evaluate})
     return Finding("needs_training", values)
 
 
@@ -241,7 +241,7 @@ def _needs_baseline(run: RunSummary) -> Finding | None:
     if not run.is_own_task or not run.has_learned:
         return None
     step, return_ = run.best_evaluation
-    best = Finding("best_evaluation", {"step": step, "return_": return_, "directory": run.directory})
+    best = Finding("best_evaluation", {"step": step, "return_": return_, "evaluate": run.evaluate})
     is_better = run.has_best_policy and return_ - run.judged_return > BETTER_FRACTION * (
         run.judged_return - run.random_mean
     )

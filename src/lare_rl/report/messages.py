@@ -113,15 +113,13 @@ MESSAGES = {
     "replace_phi": "another phi (`lare-rl design {task} --reflect 2 --model NAME`), or none (`--method bayes`)",
     "bad_raw_features": "the raw entries do not show what the score depends on",
     "write_phi": "a phi (`lare-rl prompt {task}`)",
-    "is_rising": "Next: the return was still rising. To continue: {command}.",
-    "resume": "`lare-rl train --resume {directory}`",
-    "resume_longer": "`lare-rl train --resume {directory} --steps {steps}`",
+    "is_rising": "Next: the return was still rising. To continue: `{command}`.",
     "one_seed_was_better": (
-        "Next: one seed was better than random actions at step {step:,} ({return_:number}). `lare-rl evaluate {directory} "
+        "Next: one seed was better than random actions at step {step:,} ({return_:number}). `{evaluate} "
         "--best` plays the best policy of each seed. Then more `--steps`, or another `--algorithm`."
     ),
     "has_fallen": (
-        "Next: the return was higher before, {return_:number} at step {step:,}. `lare-rl evaluate {directory} --best` plays the best "
+        "Next: the return was higher before, {return_:number} at step {step:,}. `{evaluate} --best` plays the best "
         "policy of each seed."
     ),
     "is_stuck": (
@@ -134,15 +132,14 @@ MESSAGES = {
         "it repeats one behaviour: the last {n_evaluations} returns of a seed hardly differ, but the returns of random actions do"
     ),
     "needs_training": (
-        "{limit}Next: {evaluate}more `--steps` (`lare-rl train --resume {directory}`), or another `--algorithm` (`lare-rl "
-        "algorithms`).{phi}"
+        "{limit}Next: {check}more `--steps` (`{resume}`), or another `--algorithm` (`lare-rl algorithms`).{phi}"
     ),
     "algorithm_is_limit": (
         "The proxy rewards predict returns well, so the algorithm, or the number of steps, may be the limit{agents}{rule}. "
     ),
     "among_agents": ", or how the rewards are divided among the agents, which returns do not show",
     "own_rule": " (a rule of your own can tell: `docs/how-to/poor-policies.md` of LaRe)",
-    "evaluate_more": "run `lare-rl evaluate {directory} --episodes 50`. If it is still unclear, try ",
+    "evaluate_more": "run `{evaluate} --episodes 50`. If it is still unclear, try ",
     "products_need_phi": (
         " If state and action have more than {n_features} entries together, a score that depends on products of them, such as price "
         "times power, needs a phi (`lare-rl prompt {task}`)."
@@ -152,7 +149,7 @@ MESSAGES = {
         "(`docs/how-to/poor-policies.md` of LaRe).{best}"
     ),
     "best_evaluation": (
-        " The best evaluation was {return_:number}, at step {step:,}: `lare-rl evaluate {directory} --best` plays its policy on other "
+        " The best evaluation was {return_:number}, at step {step:,}: `{evaluate} --best` plays its policy on other "
         "episodes."
     ),
     "single_seed": "One seed says little: another one may reach a different return (`--seeds 5`).",

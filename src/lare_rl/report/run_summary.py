@@ -1,7 +1,6 @@
 """The summary of a run, which its diagnosis reads."""
 
 import math
-import shlex
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -25,6 +24,7 @@ from lare_rl.runs.metric_names import (
     RETURN_STD,
     SUMMED_RETURN,
 )
+from lare_rl.tasks.trust import command_line
 from lare_rl.training.advice import describe_untrained
 from lare_rl.util.statistics import CLEAR_ERRORS, episode_error, grouped_standard_error, sample_std, standard_error
 
@@ -109,7 +109,10 @@ class RunSummary:
     """The number of seeds whose final policy chooses the same action, with each entry at a bound, in all states."""
     has_best_policy: bool = True
     """Whether the best policy of each seed is kept. It is not with several teams."""
-    directory: str = "RUN"
+    resume: str = "lare-rl train --resume RUN"
+    """The command that continues the run."""
+    evaluate: str = "lare-rl evaluate RUN"
+    """The command that evaluates the final policies."""
     """Quoted for a shell."""
     task: str = "TASK"
     """The name of a shipped task, or a placeholder for a task file, which ends in `.toml`."""
@@ -286,7 +289,8 @@ def summarise_run(
         planned_steps=settings.steps,
         warmup=settings.warmup,
         n_saturated=int(np.sum(reported.final_values(ACTOR_SATURATION) == 1)),
-        directory=shlex.quote(str(run.directory)),
+        resume=command_line(run.config.task, "train", "--resume", run.directory),
+        evaluate=command_line(run.config.task, "evaluate", run.directory),
         has_best_policy=len(task.roles) == 1,
         task=task.name if task.name in shipped_tasks() else "TASK.toml",
     )

@@ -1,6 +1,5 @@
 """Jobs, which are planned runs: their directories, their progress, and their training."""
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from lare_rl.runs.config_file import CONFIG, read_config
 from lare_rl.runs.directory import CHECKPOINT
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.tasks.trust import trust_environment, trust_prefix
+from lare_rl.tasks.trust import command_line, trust_environment
 from lare_rl.training.latent_functions import choose_functions
 
 __all__ = ["Job", "check_job", "describe_job", "make_job", "train_job"]
@@ -110,9 +109,7 @@ def check_job(job: Job) -> None:
     different_names = [name for name, value in new.items() if old.get(name) != value]
     if different_names:
         name = different_names[0]
-        command = (
-            f"{trust_prefix(job.task)}lare-rl train --resume {shlex.quote(str(job.directory))} --steps {new['steps']}"
-        )
+        command = command_line(job.task, "train", "--resume", job.directory, "--steps", new["steps"])
         can_extend = different_names == ["steps"] and new["steps"] > old["steps"]
         hint = f"extend it with {command}, or {ANOTHER_OUT}" if can_extend else ANOTHER_OUT
         raise LareError(f"{job.directory} holds a run with {name} = {old.get(name)}, not {new[name]}: {hint}")

@@ -1,5 +1,6 @@
 """Decides which modules an environment's name may import. A task file can run code, and a run directory may be untrusted."""
 
+import shlex
 import site
 import sys
 import sysconfig
@@ -13,8 +14,8 @@ from lare_rl.util.variables import read_variable
 __all__ = [
     "TRUST_VARIABLE",
     "check_trusted",
+    "command_line",
     "trust_environment",
-    "trust_prefix",
     "trusted_modules",
     "untrusted_module",
 ]
@@ -49,10 +50,11 @@ def _module_to_trust(task: TaskSpec) -> str | None:
     return module if module and module not in trusted_modules() else None
 
 
-def trust_prefix(task: TaskSpec) -> str:
-    """Return what a command must begin with to import a task's environment for a run: an assignment to `LARE_TRUST`, or nothing."""
+def command_line(task: TaskSpec, *arguments: object) -> str:
+    """Return a `lare-rl` command for a run of a task. It sets `LARE_TRUST` if it must import the module of the environment."""
     module = _module_to_trust(task)
-    return f"{TRUST_VARIABLE}={module} " if module else ""
+    prefix = f"{TRUST_VARIABLE}={module} " if module else ""
+    return prefix + shlex.join(["lare-rl", *map(str, arguments)])
 
 
 def untrusted_module(task: TaskSpec) -> str | None:

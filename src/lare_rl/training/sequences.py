@@ -16,14 +16,13 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Scalar
 from lare_rl.algorithms.batches import Metrics, Sequences
 from lare_rl.algorithms.registry import SequenceSettings
 from lare_rl.config.train_config import TrainConfig
-from lare_rl.credit.losses import is_step
 from lare_rl.data import replay
 from lare_rl.data.layouts import lay_out_padded
 from lare_rl.data.replay import Replay
 from lare_rl.data.sampling import EpisodeSample, sample_distinct_episodes
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, team_mean, with_available_action
-from lare_rl.nn.masks import select
+from lare_rl.nn.masks import select, step_mask
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, standardise_unless_empty, update_mean_std
 from lare_rl.training.decoder_fits import fit_decoders, sample_credit
 from lare_rl.training.decoder_inputs import alive_agents
@@ -182,7 +181,7 @@ def _sequences(
 ) -> Sequences:
     """Return episodes with the method's rewards. Each is padded to `n_steps` steps by copies of its last step."""
     steps = replay.read(buffer, episodes.steps(lay_out_padded(episodes.length, n_steps).step))
-    mask = is_step(episodes.length, n_steps) * episodes.mask[:, None]
+    mask = step_mask(episodes.length, n_steps) * episodes.mask[:, None]
     reward = rewards(steps, decoders, config)
 
     def all_timesteps(name: str) -> Array:

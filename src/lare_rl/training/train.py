@@ -1,7 +1,6 @@
 """Trains a run from its start, or from its last checkpoint, to its end: iterations, evaluations, checkpoints, messages."""
 
 import contextlib
-import shlex
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -21,7 +20,7 @@ from lare_rl.runs.directory import Run, as_run, create_run, default_directory, e
 from lare_rl.runs.metric_names import ACTOR_SATURATION, RETURN, was_updated
 from lare_rl.runs.metrics_file import append_metrics, truncate_metrics
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.tasks.trust import trust_prefix
+from lare_rl.tasks.trust import command_line
 from lare_rl.training import advice
 from lare_rl.training.decoder_fits import FirstFitStoppedError
 from lare_rl.training.explain import describe_returns
@@ -276,7 +275,7 @@ def _advance(session: Session, stop: threading.Event) -> None:
     """Advance a session, at most to its next evaluation. Raise `RunInterruptedError` if `stop` is set."""
     step, settings = session.step, session.settings
     run = session.run
-    hint = f"to continue: {trust_prefix(run.config.task)}lare-rl train --resume {shlex.quote(str(run.directory))}"
+    hint = f"to continue: {command_line(run.config.task, 'train', '--resume', run.directory)}"
     if stop.is_set():
         session.save()
         session.finish_saving()
