@@ -72,6 +72,8 @@ def test_read_source_and_reply_of_a_chat(path, tmp_path, chase):
     assert (loaded.source, loaded.model) == (SOURCE, "a model that is not named")
     loaded.save(tmp_path / "phi.py")
     assert load_function(tmp_path / "phi.py", chase).model == "a model that is not named"
+    (tmp_path / "reply.txt").write_text(PHI)  # reply.json is not the record of this file
+    assert load_function(tmp_path / "reply.txt", chase).exchanges == ()
 
 
 @pytest.mark.parametrize("with_record", [True, False])

@@ -83,7 +83,7 @@ def load_function(path: str | Path, task: TaskSpec | str | Path, steps: Steps | 
         return replace(function, model=_UNNAMED_LLM)
     model, exchanges, saved_source = header.get("model") or function.model, (), function.source
     json_file = file.with_suffix(".json")
-    if json_file.is_file():
+    if file.suffix == ".py" and json_file.is_file():
         model, exchanges, saved_source = _read_provenance(json_file)
     is_changed = saved_source != function.source or _was_changed(header, source)
     if is_changed and not model.endswith(CHANGED_SUFFIX):
