@@ -72,6 +72,7 @@ NAMES, GROUPED = ["cat_0", "mouse_0", "cat_1"], ["cat_0", "cat_1", "mouse_0"]
 
 def test_agent_kind():
     kinds = {"prey_12": "prey", "prey": "prey", "walker3": "walker", "red_2_1": "red_2", "7": "7", 7: "7", "_3": "_3"}
+    kinds |= {"red 1": "red", "blue team 12": "blue team"}
     assert {name: agent_kind(name) for name in kinds} == kinds
     assert group_by_team(["cat_0", "cat_1"], toy_spec()) == (["cat_0", "cat_1"], (Team("cat", 0, 2),))
 

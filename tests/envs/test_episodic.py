@@ -54,6 +54,16 @@ def test_reset_starts_a_new_sum_and_a_score_replaces_it():
     assert (rewards, [info[TRUE_REWARD] for info in infos]) == ([0.0, 0.0, 9.0], [1.0, 2.0, 4.0])
 
 
+def test_reward_is_a_number_or_the_only_one_of_an_array():
+    env = EpisodicReward(Scripted([np.array([2.0]), np.float32(1)]))
+    env.reset()
+    assert play(env, 2)[0] == [0.0, 3.0]
+    env = EpisodicReward(Scripted([np.zeros(2)]))
+    env.reset()
+    with pytest.raises(LareError, match="the reward is array"):
+        play(env, 1)
+
+
 @settings(deadline=None, max_examples=40)
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=50), st.sampled_from(["terminated", "truncated"]))
 def test_reward_is_the_sum(rewards, end):

@@ -3,13 +3,15 @@
 import pickle
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 
 from helpers.host_envs import ToyHostEnv
-from helpers.toy_envs import toy_spec
-from lare_rl.envs.families import FAMILIES, make_env, picklable_maker, register_family
+from helpers.toy_envs import Chase, toy_spec
+from lare_rl.envs.families import FAMILIES, make_env, register_family
 from lare_rl.envs.interface import EnvSpec, Team
+from lare_rl.envs.picklable_maker import picklable_maker
 from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
@@ -179,6 +181,18 @@ def test_spec_is_checked(changes, message):
     register_family(name, Unbounded)
     with pytest.raises(LareError, match=message):
         make_env(toy_spec(environment=f"{name}/two", observation_size=2, action_size=2))
+
+
+def test_a_worker_makes_the_environment_of_this_process_or_none(monkeypatch):
+    """A script may register a class of its own under the name of another environment."""
+    task = toy_spec(environment="CartPole-v1", observation_size=4, action_size=2)
+    entry = gymnasium.registry["CartPole-v1"]
+    monkeypatch.setitem(gymnasium.registry, "CartPole-v1", replace(entry, entry_point=Chase))
+    pickled = pickle.dumps(picklable_maker(task))
+    monkeypatch.setitem(gymnasium.registry, "CartPole-v1", entry)
+    with pytest.raises(LareError, match=r"CartPole-v1: a worker process makes another .*MODULE:NAME"):
+        pickle.loads(pickled)()
+    assert pickle.loads(pickle.dumps(picklable_maker(task)))().spec.max_steps == 500
 
 
 def test_a_worker_registers_a_family_that_its_maker_module_does_not(monkeypatch):

@@ -6,11 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from helpers.jax_toy_envs import Echo
+from lare_rl.envs.agent_arrays import AgentArrays, make_agent
 from lare_rl.envs.interface import EnvSpec, Team, team_mean, to_env_action, to_package_action
 from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.play import play_steps
@@ -66,6 +68,21 @@ def test_package_action_of_choices(fields, expected):
     one_hot = np.eye(6, dtype=np.float32)[[2, 3]]
     np.testing.assert_array_equal(to_package_action(one_hot, spec), expected)
     np.testing.assert_array_equal(to_package_action(one_hot[1], spec), expected[1])
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_package_action_is_in_its_space_at_the_bounds(dtype):
+    space = Box(-0.1, 0.1, (2,), dtype)
+    for spec in (
+        AgentArrays([make_agent("a", space, space)]).make_spec((Team("agent", 0, 1),), max_steps=1),
+        EnvSpec(
+            (Team("agent", 0, 1),), 1, 2, discrete=False, max_steps=1, low=space.low[None], high=space.high[None],
+            package_dtype=space.dtype,
+        ),
+    ):  # fmt: skip
+        action = to_package_action(to_env_action(np.array([[-1, 1]], np.float32), spec)[0], spec)
+        assert space.contains(action)
+        np.testing.assert_array_equal(action, [space.low[0], space.high[0]])
 
 
 def test_continuous_action_is_scaled_to_the_bounds_of_each_agent():

@@ -1,5 +1,6 @@
 """Task specs: the shipped ones fit their environments, and a bad one is refused in one line that says how to mend it."""
 
+import warnings
 from importlib.util import find_spec
 
 import gymnasium
@@ -162,3 +163,21 @@ def test_evaluation_environment():
     task = read_task("CN-6").model_copy(update={"evaluation_environment": "particles/CN-6"})
     with pytest.raises(LareError, match="evaluation_environment has no effect on particles/CN-6"):
         load_env_spec(task)
+
+
+@pytest.mark.parametrize(("name", "content"), [("masked", "has action masks"), ("one_against_two", "different agents")])
+def test_evaluation_environment_with_other_agents(name, content):
+    toys = "pettingzoo/helpers.parallel_toy_envs:"
+    keys = {"environment": f"{toys}two_against_one", "evaluation_environment": toys + name, "observation_size": 2}
+    teams = [toy_spec(name=team, team=team, agents=(f"{team}_*",), action_size=3, **keys) for team in "ab"]
+    with pytest.raises(LareError, match=content):
+        check_environment(toy_spec(action_size=3, teams=teams, **keys))
+
+
+def test_environment_that_is_registered_again():
+    task = toy_spec(environment="toys/AgainChase-v0")
+    for limit in (20, 30):
+        with warnings.catch_warnings(action="ignore"):  # that it is registered again
+            gymnasium.register("toys/AgainChase-v0", entry_point=Chase, max_episode_steps=limit)
+        check_environment(task)
+        assert load_env_spec(task).max_steps == limit

@@ -305,6 +305,26 @@ def test_toy_that_is_refused(changes, content):
         make_host(toy)
 
 
+def test_teams_in_another_order_than_their_files_alone():
+    """The function of b would be verified on states in which c stands after it."""
+    toy = Toy(("a_0", "b_0", "c_0"))
+
+    def make(scope, **patterns):
+        keys = {"credit_scope": scope, "observation_size": 6 if scope == "state" else 2}
+        sizes = {name: 3 * len(agents) if scope == "state" else 3 for name, agents in patterns.items()}
+        roles = [
+            make_task(team=name, agents=agents, action_size=sizes[name], **keys) for name, agents in patterns.items()
+        ]
+        teams = [role.model_copy(update={"name": role.team}) for role in roles]
+        return make_host(toy, teams=teams, credit_scope=scope)
+
+    for patterns in ({"x": ("a_*", "c_*"), "b": ("b_*",)}, {"b": ("b_*",), "x": ("a_*", "c_*")}):
+        make("observation", **patterns)
+        with pytest.raises(LareError, match="List the teams in the order"):
+            make("state", **patterns)
+    make("state", x=("a_*", "b_*"), c=("c_*",))
+
+
 # Invalid values later
 
 

@@ -38,6 +38,11 @@ def test_flatten_value_equals_gymnasium(space, seed):
     np.testing.assert_allclose(flatten_value(space, value), gymnasium.spaces.flatten(space, value), rtol=1e-6)
 
 
+def test_numbers_beyond_float32_where_a_simulator_lets_numpy_raise():
+    with np.errstate(all="raise"):
+        np.testing.assert_array_equal(flatten_value(PLANE, np.array([1e-60, 1e60])), [0, np.inf])
+
+
 @pytest.mark.parametrize(
     ("space", "value", "content"),
     [

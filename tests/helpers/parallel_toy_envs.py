@@ -71,3 +71,20 @@ class Toy(ParallelEnv):
 
 def raises():
     raise OSError("no asset\ntrack.bin")
+
+
+def two_against_one():
+    return Toy(("a_0", "a_1", "b_0"))
+
+
+def one_against_two():
+    return Toy(("a_0", "b_0", "b_1"))
+
+
+def masked():
+    """Two agents of `a` against one of `b`, with action masks at the reset."""
+
+    def add_masks(toy, observations, infos):
+        return observations, {agent: {"action_mask": np.ones(3, np.int8)} for agent in infos}
+
+    return Toy(("a_0", "a_1", "b_0"), spoil_reset=add_masks)

@@ -15,6 +15,7 @@ from lare_rl.new_task.many_agents import _name_patterns
         (["car", "robot_0", "car2"], ["car", "car[0-9]*"]),
         (["car_1", "car_1_trailer"], ["car_1"]),
         (["red[1]_0", "blue_0"], ["red[[]1]_[0-9]*"]),
+        (["red 1", "blue 1", "red 2"], ["red [0-9]*"]),
     ],
 )
 def test_patterns_match_the_agents_of_their_kind_alone(names, patterns):

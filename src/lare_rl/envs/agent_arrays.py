@@ -14,7 +14,7 @@ from lare_rl.envs.interface import AnyArray, EnvSpec, Team
 from lare_rl.envs.spaces import check_spaces, flatten_value, float_array
 from lare_rl.errors import LareError, short_repr
 
-__all__ = ["Agent", "AgentArrays", "fallback_state", "integer_dtype", "make_agent"]
+__all__ = ["Agent", "AgentArrays", "fallback_state", "make_agent"]
 
 MASK = "action_mask"
 """PettingZoo's key for the mask of available actions, in the observation's dictionary or in `info`."""
@@ -78,11 +78,6 @@ class Agent:
         return mask.astype(bool)
 
 
-def integer_dtype(space: Box) -> np.dtype | None:
-    """Return the type of the elements of a Box that are rounded, or None."""
-    return space.dtype if space.dtype is not None and space.dtype.kind in "biu" else None
-
-
 def make_agent(name: Any, observation: gymnasium.Space, action: gymnasium.Space) -> Agent:
     """Make an agent from its spaces. Raises `LareError` if training cannot use them."""
     observes_mask = isinstance(observation, Dict) and set(observation.spaces) == {"observation", MASK}
@@ -133,7 +128,9 @@ class AgentArrays:
     @property
     def bounds(self) -> tuple[Float[np.ndarray, "agents _"], Float[np.ndarray, "agents _"]]:
         """The lower and upper bounds of continuous actions, padded with 0. Empty for discrete actions."""
-        low, high = np.zeros((2, len(self.agents), 0 if self.discrete else self.action_size), np.float32)
+        # Bounds of float64 may lie between numbers of float32.
+        dtype = np.result_type(np.float32, *(agent.action_space.dtype for agent in self.agents if not agent.discrete))
+        low, high = np.zeros((2, len(self.agents), 0 if self.discrete else self.action_size), dtype)
         for index, agent in enumerate(self.agents):
             if isinstance(agent.action_space, Box):
                 low[index, : agent.action_size] = agent.action_space.low.ravel()
@@ -147,7 +144,7 @@ class AgentArrays:
         if len(starts) == 1:
             fields = {"first_choice": starts.pop(), **fields}
         if len(self.agents) == 1 and isinstance(space := self.agents[0].action_space, Box):
-            fields = {"package_shape": space.shape, "package_dtype": integer_dtype(space), **fields}
+            fields = {"package_shape": space.shape, "package_dtype": space.dtype, **fields}
         return EnvSpec(
             teams=teams,
             observation_size=self.observation_size,

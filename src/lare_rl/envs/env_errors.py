@@ -125,9 +125,9 @@ def convert_output(convert: Callable[[Any], T], value: Any, subject: str) -> T:
 
 
 def to_float(value: Any) -> float:
-    """Return a value as a float. Raises `ValueError`, whose message is a predicate, if it is not a number."""
+    """Return a number, or the only one of an array, as a float. Raises `ValueError`, whose message is a predicate, for anything else."""
     try:
-        return float(value)
+        return float(value.item() if getattr(value, "size", None) == 1 else value)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one of a tensor of several numbers
         raise ValueError(f"is {short_repr(value)}, which is not a number") from None
 

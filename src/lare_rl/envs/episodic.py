@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
-from lare_rl.envs.env_errors import to_float
+from lare_rl.envs.env_errors import convert_output, to_float
 from lare_rl.errors import LareError
 
 __all__ = ["TRUE_REWARD", "EpisodicReward", "read_score"]
@@ -45,13 +45,14 @@ class EpisodicReward(gymnasium.Wrapper, RecordConstructorArgs):
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Make one step. Raises `LareError` if the last step's `info` has no score."""
-        observation, true_reward, terminated, truncated, info = self.env.step(action)
-        self._return += float(true_reward)
+        """Make one step. Raises `LareError` if the reward is not a number, or if the last step's `info` has no score."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        true_reward = convert_output(to_float, reward, "the reward")
+        self._return += true_reward
         reward = 0.0
         if terminated or truncated:
             reward = self._return if self.score is None else read_score(info, self.score)
-        return observation, reward, terminated, truncated, {**info, TRUE_REWARD: float(true_reward)}
+        return observation, reward, terminated, truncated, {**info, TRUE_REWARD: true_reward}
 
 
 def read_score(info: Mapping[str, Any], key: str) -> float:

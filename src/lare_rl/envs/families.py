@@ -3,10 +3,8 @@
 The part of the name before the first slash is the family. All names without a registered family belong to Gymnasium.
 """
 
-import importlib
 import pkgutil
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -26,7 +24,6 @@ __all__ = [
     "find_score_key",
     "make_env",
     "make_local_env",
-    "picklable_maker",
     "register_family",
 ]
 
@@ -145,27 +142,6 @@ def make_local_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
     from lare_rl.envs.jax_on_host import JaxOnHost
 
     return JaxOnHost(cast("JaxEnv", env))
-
-
-def picklable_maker(task: TaskSpec) -> Callable[[], HostEnv]:
-    """Return a picklable function. In another process, it imports the module of the family's maker, then makes the environment."""
-    family = find_family(task)
-    if not isinstance(maker := family.maker, str):  # a function of a module; functions themselves may not be picklable
-        family = family._replace(maker=f"{maker.__module__}:{getattr(maker, '__qualname__', '')}")
-    return partial(_import_and_make, family, task)
-
-
-def _import_and_make(family: Family, task: TaskSpec) -> HostEnv:
-    if family.module != "__main__":
-        importlib.import_module(family.module)
-        if task.family and find_family(task) is GYMNASIUM and family != GYMNASIUM:
-            FAMILIES.register(task.family, family)  # another module than the maker's registers it in the parent process
-    elif task.family not in FAMILIES:
-        raise LareError(
-            f"{task.environment}: a worker process cannot import the script that registers {task.family!r}. "
-            "Move the family into a module of its own."
-        )
-    return make_local_env(task)
 
 
 def check_logs(task: TaskSpec) -> None:

@@ -10,7 +10,7 @@ from gymnasium.spaces import Box, Discrete
 from jaxtyping import Float
 
 from lare_rl.envs import mujoco_rewards
-from lare_rl.envs.agent_arrays import Agent, integer_dtype
+from lare_rl.envs.agent_arrays import Agent
 from lare_rl.envs.env_errors import (
     NoTimeLimitError,
     close_env,
@@ -94,7 +94,7 @@ class GymnasiumEnv:
             fields: dict[str, Any] = {
                 "low": action_space.low[None],
                 "high": action_space.high[None],
-                "package_dtype": integer_dtype(action_space),
+                "package_dtype": action_space.dtype,
             }
         else:
             fields = {"first_choice": int(action_space.start)}

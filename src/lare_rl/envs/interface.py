@@ -87,7 +87,7 @@ class EnvSpec:
     package_shape: tuple[int, ...] | None = None
     """The shape of an action for the environment's package. By default, discrete actions are numbers, continuous ones vectors."""
     package_dtype: np.dtype | None = None
-    """The type of continuous actions for the environment's package, if it is one of integers: they are rounded."""
+    """The type of continuous actions for the environment's package. They are rounded if it is one of integers."""
     agent_names: tuple[str, ...] = field(default=(), compare=False)
     """The environment's names of the agents, for messages."""
     entry_meanings: Mapping[int, str] = field(default_factory=dict, compare=False)
@@ -224,8 +224,8 @@ def to_package_action(action: Float[AnyArray, "*batch action"], spec: EnvSpec) -
     """
     xp = action.__array_namespace__()
     if not spec.discrete:
-        if spec.package_dtype is not None:
-            action = xp.rint(action).astype(spec.package_dtype)
+        if (dtype := spec.package_dtype) is not None:
+            action = (xp.rint(action) if dtype.kind in "biu" else action).astype(dtype)
         return action if spec.package_shape is None else action.reshape(*action.shape[:-1], *spec.package_shape)
     number = xp.argmax(action, axis=-1)
     if not spec.choice_sizes:

@@ -14,7 +14,7 @@ from lare_rl.envs import jax_packages
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, fallback_state, make_agent
 from lare_rl.envs.env_errors import NoTimeLimitError, one_line_errors
 from lare_rl.envs.interface import Timestep, with_available_action
-from lare_rl.envs.pettingzoo_construct import group_by_team
+from lare_rl.envs.pettingzoo_construct import check_team_order, group_by_team
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
@@ -80,6 +80,7 @@ class JaxMARLEnv:
                 raise jax_packages.unusable_error(self._name, "its observations are not a dictionary by agent")
             agents = [_make_agent(x, env.action_space(x), jax_packages.flat_size(observations[x])) for x in names]
             self.layout = AgentArrays(agents)
+            check_team_order(list(env.agents), task, self.layout)
             self._masks = _find_masks(env, state) if self.layout.discrete else None
             actions = {agent.name: jnp.asarray(agent.action_space.sample()) for agent in agents}
             infos = jax.eval_shape(env.step_env, jnp.zeros(2, jnp.uint32), state, actions)[-1]
@@ -112,7 +113,9 @@ class JaxMARLEnv:
         ended = jnp.asarray(dones[ALL], bool).reshape(()) | ~(state.alive & ~done).any()
         alive = state.alive & (ended | ~done)
         next_state = JaxMARLState(jax_packages.cast_like(env_state, state.env), state.steps + 1, alive)
-        return next_state, self._make_timestep(observations, next_state, reward * state.alive, ended, infos)
+        return next_state, self._make_timestep(
+            observations, next_state, jnp.where(state.alive, reward, 0), ended, infos
+        )
 
     def _make_timestep(
         self,
@@ -124,7 +127,7 @@ class JaxMARLEnv:
     ) -> Timestep:
         at_limit = state.steps >= self.spec.max_steps
         return Timestep(
-            observation=self._pad(observations) * state.alive[:, None],
+            observation=jnp.where(state.alive[:, None], self._pad(observations), 0),
             state=self._read_state(observations, state.env),
             available=self._read_masks(state),
             alive=state.alive,

@@ -84,6 +84,16 @@ def check_environment(spec: TaskSpec) -> None:
                 f"task {spec.name!r}: {name} is {sizes[0]} in {spec.environment}, and {sizes[1]} in {spec.evaluation_environment}: both "
                 "need the same"
             )
+    if [(team.start, team.stop) for team in env.teams] != [(team.start, team.stop) for team in other.teams]:
+        raise LareError(
+            f"task {spec.name!r}: the teams of {spec.environment} and {spec.evaluation_environment} have different agents: both need "
+            "the same"
+        )
+    if other.masks_actions and not env.masks_actions:
+        raise LareError(
+            f"task {spec.name!r}: {spec.evaluation_environment} has action masks, and {spec.environment} has none: the policy would "
+            "ignore them"
+        )
     for name in ("low", "high"):
         if not np.array_equal(getattr(env, name), getattr(other, name)):
             raise LareError(

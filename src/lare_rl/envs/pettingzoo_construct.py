@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from lare_rl.envs.agent_arrays import AgentArrays
 from lare_rl.envs.env_errors import import_hint, one_line_errors
 from lare_rl.envs.interface import Team
 from lare_rl.errors import LareError, did_you_mean, short_repr
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec, split_environment
 from lare_rl.tasks.trust import trusted_modules
 
-__all__ = ["agent_kind", "find_time_limit", "group_by_team", "make_parallel_env"]
+__all__ = ["agent_kind", "check_team_order", "find_time_limit", "group_by_team", "make_parallel_env"]
 
 REQUIRED = ("possible_agents", "observation_space", "action_space", "reset", "step")
 """The attributes of a ParallelEnv."""
@@ -71,7 +72,7 @@ def find_time_limit(env: Any, arguments: Mapping[str, Any]) -> int | None:
 
 def agent_kind(name: Any) -> str:
     """Return an agent's name without its number: `prey` for `prey_0`."""
-    return re.sub(r"_?\d+$", "", str(name)) or str(name)
+    return re.sub(r"[\s_]*\d+$", "", str(name)) or str(name)
 
 
 def group_by_team(names: Sequence[Any], task: TaskSpec) -> tuple[list[Any], tuple[Team, ...]]:
@@ -102,6 +103,24 @@ def group_by_team(names: Sequence[Any], task: TaskSpec) -> tuple[list[Any], tupl
         kinds = {agent_kind(name) for name in names}
         teams = {kinds.pop() if len(kinds) == 1 else "agent": list(names)}
     return _make_teams(teams)
+
+
+def check_team_order(names: Sequence[Any], task: TaskSpec, layout: AgentArrays) -> None:
+    """Check that the file of each team alone gives the agents the order that they have in the task.
+
+    If observations or the joint state depend on it, a function would be verified on other entries than it reads in training.
+    Raises `LareError`.
+    """
+    if not (layout.adds_index or task.credit_scope == "state"):
+        return
+    order = [agent.name for agent in layout.agents]
+    for role in task.teams:
+        if group_by_team(names, role)[0] != order:
+            raise LareError(
+                f"task {task.name!r}: its teams have the agents {', '.join(map(str, order))}, but {role.name!r} alone has another order, "
+                f"and entries depend on it. List the teams in the order of the environment's agents ({', '.join(map(str, names))}), with "
+                "neighbouring kinds of agents in each"
+            )
 
 
 def _make_teams(members: Mapping[str, Sequence[Any]]) -> tuple[list[Any], tuple[Team, ...]]:

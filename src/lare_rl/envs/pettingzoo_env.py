@@ -22,7 +22,7 @@ from lare_rl.envs.env_errors import (
     to_float,
 )
 from lare_rl.envs.interface import Timestep, with_available_action
-from lare_rl.envs.pettingzoo_construct import find_time_limit, group_by_team, make_parallel_env
+from lare_rl.envs.pettingzoo_construct import check_team_order, find_time_limit, group_by_team, make_parallel_env
 from lare_rl.envs.spaces import float_array
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec, entry_meanings
@@ -65,6 +65,7 @@ class ParallelHost:
                 spaces = [(environment.observation_space(name), environment.action_space(name)) for name in names]
             agents = [make_agent(name, *pair) for name, pair in zip(names, spaces, strict=True)]
             self.layout = AgentArrays(agents)
+            check_team_order(environment.possible_agents, task, self.layout)
         except LareError as error:
             raise LareError(f"{self._label}: {error}") from None
         max_steps = task.max_episode_steps or find_time_limit(environment, task.arguments)

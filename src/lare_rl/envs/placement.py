@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.envs.env_errors import close_env
-from lare_rl.envs.families import GYMNASIUM, find_family, make_env, make_local_env, picklable_maker
+from lare_rl.envs.families import GYMNASIUM, Family, find_family, make_env, make_local_env
 from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
+from lare_rl.envs.picklable_maker import picklable_maker, registry_entry
 from lare_rl.envs.trials import time_steps
 from lare_rl.envs.vec_env import LocalVecEnv, VecEnv, first_timestep
 from lare_rl.envs.worker_process import WorkerTimeoutError
@@ -54,6 +55,8 @@ _log = logging.getLogger(__name__)
 _FAMILIAR_PACKAGES = {"gymnasium", "gymnasium_robotics", "lare_rl", "mpe2", "pettingzoo", "minigrid", "ale_py"}
 """Packages whose environments can share a process. Environments of others are tried."""
 
+_env_specs: dict[TaskSpec, tuple[EnvSpec, Family, Any]] = {}
+"""The specifications of the environments that were made, with their entries in the registries: a name may be registered again."""
 _separate_tasks: dict[TaskSpec, bool] = {}
 """Whether each environment of a task needs its own process, for the tasks that have been tried."""
 
@@ -89,12 +92,15 @@ def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
     return SeparateEnv(task) if is_known_separate(task) and not kwargs else make_local_env(task, **kwargs)
 
 
-@lru_cache(maxsize=64)
 def load_env_spec(task: TaskSpec) -> EnvSpec:
     """Return the specification of a task's environment, which is made once for this. Raises `LareError` like `make_env`."""
+    spec, family, entry = _env_specs.get(task, (None, None, None))
+    if spec is not None and family == find_family(task) and entry is registry_entry(task):
+        return spec
     env = make_host_env(task) if task.processes == "separate" else make_env(task)
     if not env.spec.is_jax:
         close_env(env, f"environment {task.environment!r}")
+    _env_specs[task] = env.spec, find_family(task), registry_entry(task)
     return env.spec
 
 

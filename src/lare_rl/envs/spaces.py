@@ -67,7 +67,8 @@ def float_array(value: Any, shape: tuple[int, ...] | None = None) -> Float[np.nd
     Raises `ValueError`, whose message is a predicate, if it is not an array of numbers or does not have this shape.
     """
     try:
-        with np.errstate(over="ignore"):  # numbers beyond float32 become infinite, which `check_finite` refuses
+        # Numbers beyond float32 become infinite, which `check_finite` refuses. A simulator may have set NumPy to raise.
+        with np.errstate(all="ignore"):
             array = np.array(value, np.float32)  # a copy: the environment may write the next value into the same memory
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"is {short_repr(value)}, which is not an array of numbers") from None

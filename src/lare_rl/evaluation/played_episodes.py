@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from lare_rl.config.train_config import TrainConfig
 from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.interface import JaxEnv
+from lare_rl.envs.interface import JaxEnv, team_means
 from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.play import make_episode
 from lare_rl.runs.directory import Run
@@ -184,8 +184,9 @@ def sample_steps(run: Run, actor: Any = None) -> list[TeamSample]:
     config, samples = played.config, []
     ended = played.mask & ~np.append(played.mask[1:], np.zeros_like(played.mask[:1]), axis=0)
     # Of the steps that a payment is for.
-    is_last = is_paid(config.payments, np.arange(len(ended))[:, None], played.reward, ended)
-    is_known = bool(has_step_rewards(played.reward, is_last[..., None], played.mask[..., None]))
+    team_reward = team_means(played.reward, np.asarray(played.steps.timestep.alive), config.env)
+    is_last = is_paid(config.payments, np.arange(len(ended))[:, None], team_reward, ended)
+    is_known = bool(has_step_rewards(team_reward, is_last[..., None], played.mask[..., None]))
     steps = jax.tree.map(lambda leaf: np.asarray(leaf)[played.mask], played.steps)  # [steps ...]
     for team_index, role in enumerate(run.config.task.roles):  # its rows of all episodes, as if they were one
         rows = make_episode(role, config.env, steps.timestep, steps.env_action, steps.next_timestep)

@@ -114,7 +114,7 @@ def _name_patterns(kind: str, names: Sequence[str]) -> list[str]:
     members, stem = [name for name in names if agent_kind(name) == kind], glob.escape(kind)
     patterns = [
         pattern
-        for pattern in (stem, f"{stem}_[0-9]*", f"{stem}[0-9]*")
+        for pattern in (stem, f"{stem}_[0-9]*", f"{stem} [0-9]*", f"{stem}[0-9]*")
         if any(fnmatchcase(name, pattern) for name in members)
     ]
     matched_names = [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]

@@ -1,0 +1,61 @@
+"""Makes environments in other processes."""
+
+import importlib
+from collections.abc import Callable
+from functools import partial
+
+import gymnasium
+
+from lare_rl.envs.env_errors import close_env
+from lare_rl.envs.families import FAMILIES, GYMNASIUM, Family, find_family, make_local_env
+from lare_rl.envs.interface import HostEnv
+from lare_rl.errors import LareError
+from lare_rl.tasks.spec import TaskSpec, split_environment
+
+__all__ = ["picklable_maker", "registry_entry"]
+
+
+def picklable_maker(task: TaskSpec) -> Callable[[], HostEnv]:
+    """Return a picklable function. In another process, it imports the module of the family's maker, then makes the environment.
+
+    There it raises `LareError` if Gymnasium's registry has another environment of this name.
+    """
+    family = find_family(task)
+    if not isinstance(maker := family.maker, str):  # a function of a module; functions themselves may not be picklable
+        family = family._replace(maker=f"{maker.__module__}:{getattr(maker, '__qualname__', '')}")
+    return partial(_import_and_make, family, task, _describe_entry(registry_entry(task)))
+
+
+def registry_entry(task: TaskSpec) -> gymnasium.envs.registration.EnvSpec | None:
+    """Return the entry of a task's environment in Gymnasium's registry. None if there is none, or its module was not imported."""
+    _, name = split_environment(task.environment)
+    return gymnasium.registry.get(name) if find_family(task) is GYMNASIUM else None
+
+
+def _describe_entry(entry: gymnasium.envs.registration.EnvSpec | None) -> tuple[str, int | None] | None:
+    """Return the maker and the time limit of a registered environment, for a comparison with another process."""
+    if entry is None:
+        return None
+    maker = entry.entry_point
+    name = maker if isinstance(maker, str) else f"{maker.__module__}:{getattr(maker, '__qualname__', '')}"
+    return name, entry.max_episode_steps
+
+
+def _import_and_make(family: Family, task: TaskSpec, entry: tuple[str, int | None] | None) -> HostEnv:
+    if family.module != "__main__":
+        importlib.import_module(family.module)
+        if task.family and find_family(task) is GYMNASIUM and family != GYMNASIUM:
+            FAMILIES.register(task.family, family)  # another module than the maker's registers it in the parent process
+    elif task.family not in FAMILIES:
+        raise LareError(
+            f"{task.environment}: a worker process cannot import the script that registers {task.family!r}. "
+            "Move the family into a module of its own."
+        )
+    env = make_local_env(task)
+    if entry is not None and _describe_entry(registry_entry(task)) != entry:
+        close_env(env, f"environment {task.environment!r}")
+        raise LareError(
+            f"{task.environment}: a worker process makes another environment of this name, because it cannot import the script that "
+            "registers this one. Move gymnasium.register into a module, and use MODULE:NAME."
+        )
+    return env
