@@ -70,7 +70,8 @@ def test_reply_among_other_words(text, understand):
 
 def test_fence_in_a_docstring():
     source = 'def evaluation_func(observation, action):\n    """Scores.\n    ```\n    x = 1\n    ```\n    """\n    return [action]'
-    assert parse_reply(json.dumps(GOOD | {"Functions": source})).functions == source
+    for code in (source, f"""'''Scores.\n```\nx\n```\n'''\n{CODE}"""):
+        assert parse_reply(json.dumps(GOOD | {"Functions": code})).functions == code
 
 
 def test_functions_of_several_fences():

@@ -66,10 +66,14 @@ EXPRESSIONS = {
         np.ascontiguousarray(x[:, :2]) | np.asfortranarray(x) | np.vectorize(lambda v: v * 2)(x)
         np.multiply(x, 2, out=np.zeros_like(x)) | np.divide(x, a[:, :1], out=np.zeros_like(x), where=b) | np.add(b, x < 1, dtype=int)
         (lambda v: [np.nan_to_num(v, copy=False, nan=7.0), v][1])(n * 1.0) | np.reciprocal(i + 2) | np.reciprocal(-1 - i)
+        np.fabs(b) + np.fabs(b) | np.fabs(i) / 2 | np.logaddexp.reduce(np.where(b, x, -np.inf), axis=1) | np.log1p(np.abs(x) * 1e-6) * 1e6
+        np.expm1(x * 1e-6) * 1e6 | np.hypot(x * 1e18, 1e18) / 1e18 | np.round(x, 1) // 0.1 | np.round(x, 1) % 0.1 < 0.05
+        np.signbit(x * 0) | np.copysign(1.0, x * 0) | np.arctan2(x * 0, -np.abs(x)) | np.arctan2(0.0, x * 0) | np.arctan2(x * 0, x * 0)
         np.piecewise(i, [i < 2], [0.5, 1.7]) | b ** 2 + b ** 2 | np.square(b) + np.square(b)
         np.isnan(b) | np.isinf(i) | np.isclose(i, i[:, ::-1])
     """,
     "reductions": """
+        np.nan_to_num(np.max(n, axis=1)) | np.nan_to_num(n.min(axis=1), nan=9.0) | np.argmax(n, axis=1) | np.argmin(n, axis=1)
         np.sum(x, axis=1) | x.sum(-1) | y.sum(axis=(1, 2)) | np.sum(y, axis=2, keepdims=True) | np.sum(x, axis=1, where=b)
         np.sum(x, axis=1, initial=2.0) | np.prod(x, axis=1) | np.max(x, axis=1) | x.max(axis=-1, keepdims=True) | np.amin(y, axis=1)
         np.max(x, axis=1, where=b, initial=-9) | np.any(b, axis=1) | b.all(axis=1) | np.argmax(x, axis=1) | y.argmin(axis=2) | x.mean(1)

@@ -1,6 +1,7 @@
 """Functions of Python's own modules give Python's numbers."""
 
 import collections
+import collections.abc
 import functools
 import itertools
 import math
@@ -11,6 +12,7 @@ import pytest
 
 from helpers.toy_envs import phi_source
 from lare_rl.phi.evaluate import evaluate
+from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.read import read
 
 MODULES = {module.__name__: module for module in (math, itertools, functools, operator, collections)}
@@ -43,6 +45,13 @@ EXPRESSIONS = """
     list(itertools.accumulate([1, 3, 2], func=max))[2] | sum(itertools.accumulate([1, 2], None)) | len(list(itertools.repeat('a', 2)))
     'secret' in str({'path': ['secret.txt']}) | len(str({'a': (1,), 2: []})) | len(repr({1.5}))
     len(list(itertools.product([1], repeat=0))) | len(f"{'a'!r}{set()}") | len(repr('a'))
+    len(f'{5!s:>4}') | len(f'{None!s:6}') | len('{!r}'.format('a')) | len(f"{'é'!a}") | int('1_000') | int('1700000000000000000')
+    float('1' + '0' * 70) | float('1_0.5') | list({5, 2, 0})[0] | {'a': 1, 'b': 2}.keys() == {'b': 2, 'a': 1}.keys()
+    {'a': 1}.keys() == {'a'} | len({'a': 1, 'b': 2}.keys() & {'b', 'c'}) | list({3: 1, 1: 2}.keys())[0] | len(str({'a': 1}.keys()))
+    {1, 2} < {1, 2, 3} | {1} <= {2} | {1, 2} == {2, 1} | 'a b'.rpartition(' ')[2] == 'b' | len('a b'.splitlines())
+    isinstance('a', collections.abc.Sequence) | isinstance({}, collections.abc.Iterable) | isinstance(len, collections.abc.Callable)
+    isinstance(range(3), collections.abc.Sequence) | hasattr([1], '__len__') | hasattr({}, '__iter__') | hasattr(5, '__len__')
+    bool(x for x in []) | 1 if filter(None, [0]) else 0 | callable(len) | callable(5)
     collections.OrderedDict([('a', 2)])['a'] | float('%.3f' % 1.23456) | float('{:.1f}'.format(2.25)) | float(f'{1.5:.2f}')
 """
 
@@ -73,6 +82,15 @@ def test_number_is_that_of_python(expressions):
         "def f(a, b=2):\n    return a * b\ntry:\n    n = f(1, a=3)\nexcept TypeError:\n    n = 7",
         "def f(a, /, **more):\n    return a + more['a']\nn = f(1, a=3)",
         "from numpy import *\nn = r_[1, 2][1]",
+        "it = iter([1, 2, 3])\nn = (2 in it) + next(it)",
+        "it = (x for x in [1, 2, 5])\nn = 10 * any(x > 1 for x in it)\nn += any(map(abs, [0, 0]))",
+        "it = iter([0, 3, 4])\nn = any(it) + sum(it)",
+        "class A:\n    def f(self):\n        return 1\nclass B:\n    def f(self):\n        return 2\nclass C(A):\n    pass\n"
+        "class D(C, B):\n    pass\nn = D().f()",
+        "class A:\n    def f(self):\n        return 1\nclass B(A):\n    def f(self):\n        return 10 + super().f()\n"
+        "class C(A):\n    def f(self):\n        return 100 + super().f()\nclass D(B, C):\n    pass\nn = D().f()",
+        "import numpy as np\nn = len({f'{v:.1f}': v for v in np.array([0.5, 1.5])}) + len(f'{np.mean([1, 2]):.1f}')",
+        "import numpy as np\nn = len([0] * round(np.float64(1.6))) + [5, 6, 7][round(np.float64(1.2))] + len(str(round(np.float64(2.5))))",
         "from dataclasses import dataclass, field\n@dataclass\nclass A:\n    x: list = field(default_factory=list)\n"
         "a, b = A(), A()\na.x.append(1)\nn = len(b.x)",
     ],
@@ -83,3 +101,18 @@ def test_statements_have_their_effect_in_python(statements):
     graph = read(phi_source(f"{statements}\nreturn [observation[:, :1] * 0 + n]"), 17, 6)
     inputs = {"observation": np.ones((1, 17)), "action": np.ones((1, 6))}
     assert evaluate(graph, inputs)["factors"] == names["n"]
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "n = ord('a')", "n = pow(2, 5, 7)", "n = np.sum([])", "n = complex(1, 2).real", "n = int('ff', 16)", "n = hash(3)",
+        "l[0:2] = [5]", "n = len(f'{np.ones(2):.1f}')", "n = getattr([], '__len__', 3)", "n = isinstance(frozenset(), frozenset)",
+        "n = len('9' * 2000) + int('9' * 2000)",
+    ],
+)  # fmt: skip
+def test_what_is_missing_cannot_be_caught(statement):
+    """Python would carry out the statement, and never reach the handler."""
+    body = f"l, n = [1, 2, 3], 0\ntry:\n    {statement}\nexcept Exception:\n    n = 9\nreturn [observation[:, :1] * n]"
+    with pytest.raises(RefusedError):
+        read("import numpy as np\n" + phi_source(body), 17, 6)

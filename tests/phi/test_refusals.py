@@ -107,7 +107,7 @@ BODIES = {
     "return [np.sum(observation.sum)]": "E-RUN line 3: no array can be made of a function",
     "return [observation.T()]": "E-RUN line 3: an array cannot be called",
     "return {1: action}": "E-FORM line 3: not a dict",
-    "return [observation.tolist(1)]": "E-RUN line 3: too many positional arguments",
+    "return [observation.tolist(1)]": "E-PYTHON line 3: too many positional arguments",
     "return [observation.astype(None)]": "E-NUMPY line 3: None is",
     "return [observation.astype(lambda x: x)]": "E-NUMPY line 3: a function is",
     "return [np.linspace('a', 1)]": "E-RUN line 3: not a str",
@@ -139,7 +139,7 @@ ACCEPTED = set(
     "builtin_as_value inner_function_returned dunder_parameter dunder_loop_target comprehension_rebinds_np loop_rebinds_range "
     "with_two_contexts errstate_raise dtype_by_variable dtype_by_condition starred_subscript string_default_of_get "
     "einsum_pattern_by_key annotation_walrus annotation_lambda module_constant_appended import_swapped finfo_machar decorated "
-    "round_to_minus_1e9_digits "
+    "round_to_minus_1e9_digits order_of_a_set_from_keys rare_order_of_a_set "
     # Their factors are not finite.
     "np_empty nan_division nan_log_negative inf_exp dtype_complex float_nan_string".split()
 )

@@ -67,7 +67,7 @@ def test_long_texts_are_shortened_in_the_middle():
         (HEAD + "    return {'a': float('nan')}\n", ["E-FORM", "'a'"]),
         (HEAD + "    return {'a': arguments['missing']}\n", ["E-RUN", "line 2", "missing"]),
         (HEAD + "    return {'a': find_numbers(3)}\n", ["E-RUN", "find_numbers takes a text"]),
-        (HEAD + "    return {'a': open('x')}\n", ["E-RUN", "open"]),
+        (HEAD + "    return {'a': open('x')}\n", ["E-PYTHON", "open"]),
         ("import re\n" + HEAD + "    return {'a': 1}\n", ["E-IMPORT", "re"]),
         (HEAD + "    while True:\n        pass\n", ["E-COST", "steps"]),
         (HEAD + "    x = result\n    while True:\n        x = x + x\n", ["E-COST"]),

@@ -67,7 +67,10 @@ def parse_reply(text: str) -> Reply:
     except LareError as error:
         raise MalformedReplyError(f"the reply's JSON object does not have the requested form: {error}") from error
     fences = list(_FENCED_BLOCK.finditer(reply.functions))
-    is_fenced = fences and "def " not in reply.functions[: fences[0].start()]
+    # A fence may also stand in the docstring of a function that has no fence.
+    is_fenced = "def " not in _FENCED_BLOCK.sub("", reply.functions) and any(
+        "def " in fence["code"] for fence in fences
+    )
     functions = _join_functions(fences) if is_fenced else reply.functions
     texts = {"understand": reply.understand, "analyze": reply.analyze, "functions": functions}
     for value in texts.values():

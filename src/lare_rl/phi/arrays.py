@@ -270,7 +270,7 @@ def as_array(value: Any) -> Array:
         return Array(current_builder().constant(value), None)
     if isinstance(value, (list, tuple, range)):
         if not len(value):
-            raise TypeError("an empty list has no numbers")
+            raise RefusedError("E-NUMPY", "an empty list has no numbers")
         current_builder().spend(len(value))
         if all(isinstance(item, (bool, int, float)) for item in value):
             return Array(current_builder().constant(list(value)), None)

@@ -64,14 +64,14 @@ def call(runtime: Runtime, function: Any, args: Sequence[Any], kwargs: Mapping[s
 
 
 def _call_python(name: str, function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
-    """Call a function of LaRe. A message about its arguments gets the name that the program knows."""
+    """Call a function of LaRe. Raises `RefusedError` for arguments that it does not take, which Python's function may take."""
     try:
         return function(*args, **kwargs)
     except TypeError:
         try:
             inspect.signature(function).bind(*args, **kwargs)
         except TypeError as error:
-            raise TypeError(f"{name}: {error}") from None
+            raise RefusedError("E-PYTHON", f"{name}: {error}") from None
         raise
 
 
@@ -173,13 +173,26 @@ def make_class(runtime: Runtime, statement: ast.ClassDef, scope: Scope) -> Class
     body = Scope(scope.closure, "class")
     runtime.run(statement.body, body)
     fields = body.pop("__annotations__", [])
-    above = list(dict.fromkeys([*program_bases, *(base for cls in program_bases for base in cls.bases)]))
-    runtime.meter.pay(len(above))
-    cls = Class(statement.name, dict(body), above, fields, "typing.NamedTuple" in names)
+    cls = Class(
+        statement.name, dict(body), _resolution_order(runtime, program_bases), fields, "typing.NamedTuple" in names
+    )
     for value in cls.attributes.values():
         if isinstance(value, Function):
             value.owner = cls
     return cls
+
+
+def _resolution_order(runtime: Runtime, bases: Sequence[Class]) -> list[Class]:
+    """Return the classes above a class with these bases, in the order in which attributes are searched (Python's C3)."""
+    chains, order = [*([base, *base.bases] for base in bases), list(bases)], []
+    while chains := [chain for chain in chains if chain]:
+        runtime.meter.pay(sum(map(len, chains)))
+        first = next((chain[0] for chain in chains if not any(chain[0] in other[1:] for other in chains)), None)
+        if first is None:
+            raise TypeError("the bases of a class have no consistent order")
+        order.append(first)
+        chains = [chain[1:] if chain[0] is first else chain for chain in chains]
+    return order
 
 
 def decorate(runtime: Runtime, value: Any, decorators: Sequence[ast.expr], scope: Scope) -> Any:
@@ -237,8 +250,10 @@ def _unwrap(runtime: Runtime, cls: Class, value: Any) -> Any:
 
 
 def super_object(scope: Scope) -> Instance:
-    """Return `super()`: the object of a method, with the attributes of the bases of the method's class."""
+    """Return `super()`: the object of a method, with the attributes of the classes after the method's class in its order."""
     owner, instance = scope.function.owner, scope.function.instance
-    if owner is None or not owner.bases or not isinstance(instance, (Instance, Class)):
-        raise TypeError("super() is for methods of a class with a base")
-    return Instance(Class(owner.name, {}, owner.bases), bound_to=instance)
+    cls = instance.cls if isinstance(instance, Instance) else instance
+    order = [cls, *cls.bases] if isinstance(cls, Class) else []
+    if owner not in order:
+        raise TypeError("super() is for methods of a class")
+    return Instance(Class(owner.name, {}, order[order.index(owner) + 1 :]), bound_to=instance)

@@ -12,7 +12,7 @@ from lare_rl.phi.numpy_functions import call_numpy
 from lare_rl.phi.numpy_functions.registry import dtype_name
 from lare_rl.phi.operand import Operand
 from lare_rl.phi.runtime import Runtime, check_key
-from lare_rl.phi.values import Instance, Symbol, describe
+from lare_rl.phi.values import Instance, Iterator, Set, Symbol, describe
 
 __all__ = ["compare"]
 
@@ -32,6 +32,10 @@ def compare(runtime: Runtime, op: ast.cmpop, x: Any, y: Any) -> Any:
             return _contains(runtime, y, x) == isinstance(op, ast.In)
         if isinstance(y, Array):
             return runtime.truth(call_numpy("any", [y == x], {})) == isinstance(op, ast.In)
+        if isinstance(y, Iterator):
+            return any(runtime.truth(compare(runtime, ast.Eq(), x, item)) for item in y.read()) == isinstance(
+                op, ast.In
+            )
         if isinstance(y, dict):
             x = check_key(x)
         elif isinstance(x, Operand) and isinstance(y, (list, tuple)):
@@ -40,6 +44,8 @@ def compare(runtime: Runtime, op: ast.cmpop, x: Any, y: Any) -> Any:
         return _is_same_type(x, y, strict=isinstance(op, (ast.Is, ast.IsNot))) == isinstance(op, (ast.Is, ast.Eq))
     elif isinstance(op, (ast.Is, ast.IsNot)):
         pass
+    elif isinstance(x, Set) and isinstance(y, Set):
+        x, y = set(x), set(y)
     elif isinstance(x, Instance) or isinstance(y, Instance):
         return _compare_instances(runtime, op, x, y)
     elif isinstance(x, Operand) != isinstance(y, Operand):

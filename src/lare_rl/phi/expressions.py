@@ -13,7 +13,7 @@ from lare_rl.phi.limits import MAX_INT_BITS, RefusedError
 from lare_rl.phi.numpy_functions import INDEXED, call_numpy
 from lare_rl.phi.operand import Operand
 from lare_rl.phi.runtime import BINARY, Runtime, check_key, check_number, check_text, make_set
-from lare_rl.phi.text import combine_values, format_value, represent_value
+from lare_rl.phi.text import combine_values, convert_value, format_value
 from lare_rl.phi.values import Class, Function, Instance, Iterator, Scope, Set, Symbol, describe
 
 __all__ = ["apply_binary", "evaluate", "get_item", "list_items", "test_truth"]
@@ -96,7 +96,7 @@ def test_truth(runtime: Runtime, value: Any) -> bool:
             if value.cls.has(method):
                 return bool(runtime.call(runtime.attribute(value, method), [], {}))
         return not value.cls.is_tuple or bool(value.cls.fields)
-    return bool(value)
+    return isinstance(value, Iterator) or bool(value)
 
 
 def list_items(runtime: Runtime, value: Any) -> Sequence[Any]:
@@ -109,6 +109,8 @@ def list_items(runtime: Runtime, value: Any) -> Sequence[Any]:
             value.clear()
         case list() | tuple() | range() | str():
             items = value
+        case Set():
+            items = value.entries
         case dict() | Array():
             items = list(value)
         case Instance() if value.cls.is_tuple:
@@ -174,9 +176,9 @@ def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
             return text
         case ast.FormattedValue(value=value, conversion=conversion, format_spec=spec):
             format_spec, value = "" if spec is None else runtime.evaluate(spec, scope), runtime.evaluate(value, scope)
-            if conversion in (ord("r"), ord("a")):
-                value = represent_value(runtime.meter, value)
-            return format_value(runtime.meter, value, format_spec)
+            return format_value(
+                runtime.meter, convert_value(runtime.meter, value, chr(max(conversion, 0))), format_spec
+            )
         case ast.Yield() | ast.YieldFrom():
             return _evaluate_yield(runtime, node, scope)
     raise RefusedError("E-PYTHON", f"{type(node).__name__.lower()} is not available")

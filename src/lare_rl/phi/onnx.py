@@ -1,6 +1,7 @@
 """Writes a graph as an ONNX model (https://onnx.ai), for runtimes in other languages and on other devices.
 
 Every operation of a graph has a form in ONNX; some need several of its operations. All inputs and outputs have one batch axis.
+Integers have 64 bits here and 32 in `evaluate`: results differ where 32 bits overflow.
 """
 
 import math
@@ -38,16 +39,76 @@ COMPOSED: dict[str, Callable[..., str]] = {
     "not_equal": lambda op, x, y: op("Not", op("Equal", x, y)),
     "isfinite": lambda op, x: op("Not", op("Or", op("IsNaN", x), op("IsInf", x))),
     "trunc": lambda op, x: op("Mul", op("Sign", x), op("Floor", op("Abs", x))),
-    "log1p": lambda op, x: op("Log", op("Add", x, 1.0)),
-    "expm1": lambda op, x: op("Sub", op("Exp", x), 1.0),
     "exp2": lambda op, x: op("Pow", np.float32(2), x),
     "log2": lambda op, x: op("Mul", op("Log", x), 1 / math.log(2)),
     "log10": lambda op, x: op("Mul", op("Log", x), 1 / math.log(10)),
     "cbrt": lambda op, x: op("Mul", op("Sign", x), op("Pow", op("Abs", x), 1 / 3)),
-    "hypot": lambda op, x, y: op("Sqrt", op("Add", op("Mul", x, x), op("Mul", y, y))),
-    "left_shift": lambda op, x, y: op("Mul", x, op("Pow", np.array(2), y)),
+    "left_shift": lambda op, x, y: op("Mul", x, _power_of_two(op, y)),
 }
 """Operations that are several operations of ONNX. `op` adds one of these."""
+
+
+def _composed(function: Callable[..., str]) -> Callable[..., str]:
+    """Register an operation that is several operations of ONNX, under the name of the function."""
+    COMPOSED[function.__name__] = function
+    return function
+
+
+@_composed
+def log1p(op: Callable[..., str], x: str) -> str:
+    """Correct the rounding error of u = 1 + x (HP-15C Advanced Functions Handbook, 1982): log(u) x / (u - 1)."""
+    u = op("Add", x, 1.0)
+    is_exact = op("Or", op("Equal", u, 1.0), op("Equal", u, math.inf))
+    return op("Where", is_exact, x, op("Div", op("Mul", op("Log", u), x), op("Sub", u, 1.0)))
+
+
+@_composed
+def expm1(op: Callable[..., str], x: str) -> str:
+    """Correct the rounding error of u = exp(x), for small x: (u - 1) x / log(u)."""
+    u = op("Exp", x)
+    difference = op("Sub", u, 1.0)
+    small = op("Where", op("Equal", u, 1.0), x, op("Div", op("Mul", difference, x), op("Log", u)))
+    return op("Where", op("Less", op("Abs", x), 1.0), small, difference)
+
+
+@_composed
+def hypot(op: Callable[..., str], x: str, y: str) -> str:
+    """Return m sqrt(1 + (n / m)^2) for m >= n >= 0: no square overflows."""
+    sizes = op("Abs", x), op("Abs", y)
+    largest, smallest = op("Max", *sizes), op("Min", *sizes)
+    ratio = op("Div", smallest, largest)
+    length = op("Mul", largest, op("Sqrt", op("Add", op("Mul", ratio, ratio), 1.0)))
+    length = op("Where", op("Equal", largest, 0.0), largest, length)
+    return op("Where", op("Or", op("IsInf", x), op("IsInf", y)), math.inf, length)
+
+
+@_composed
+def copysign(op: Callable[..., str], x: str, y: str) -> str:
+    magnitude = op("Abs", x)
+    return op("Where", _is_negative(op, y), op("Neg", magnitude), magnitude)
+
+
+@_composed
+def arctan2(op: Callable[..., str], y: str, x: str) -> str:
+    half_turn = op("Where", _is_negative(op, y), np.float32(-math.pi), np.float32(math.pi))
+    quarter_turn = op("Mul", op("Sign", y), math.pi / 2)
+    angle = op("Atan", op("Div", y, x))
+    on_axis = op("Where", op("Equal", y, 0.0), op("Where", _is_negative(op, x), half_turn, y), quarter_turn)
+    half_plane = op("Where", op("Equal", x, 0.0), on_axis, op("Add", angle, half_turn))
+    return op("Where", op("Greater", x, 0.0), angle, half_plane)
+
+
+def _is_negative(op: Callable[..., str], x: str) -> str:
+    """Return whether a number is below 0, or is -0.0."""
+    return op("Or", op("Less", x, 0.0), op("Less", op("Div", 1.0, x), 0.0))
+
+
+def _power_of_two(op: Callable[..., str], exponent: str) -> str:
+    return op("Pow", np.array(2), op("Max", op("Min", exponent, np.array(MAX_SHIFT)), np.array(0)))
+
+
+MAX_SHIFT = 31
+"""The largest number of bits that an integer of 32 bits is shifted by."""
 DTYPES = {"float": np.float32, "int": np.int64, "bool": np.bool_}
 """The types of inputs and outputs."""
 
@@ -137,10 +198,16 @@ class _Writer:
                 return self._write_rearrangement(node, x, inputs)
             case "argmax" | "argmin":
                 numbers = self.cast(x[0], "float") if inputs[0].kind == "bool" else x[0]
-                return op({"argmax": "ArgMax", "argmin": "ArgMin"}[node.op], numbers, axis=option, keepdims=0)
+                index = op({"argmax": "ArgMax", "argmin": "ArgMin"}[node.op], numbers, axis=option, keepdims=0)
+                if inputs[0].kind != "float":
+                    return index
+                is_nan = self.cast(op("IsNaN", x[0]), "float")  # NumPy returns the index of the first NaN
+                return op("Where", self._has_nan(x[0], option), op("ArgMax", is_nan, axis=option, keepdims=0), index)
             case "sum" | "prod" | "max" | "min" | "any" | "all":
                 numbers = self.cast(x[0], "int") if kind == "bool" else x[0]
                 result = op(REDUCTIONS[node.op], numbers, np.array(option, int), keepdims=0)
+                if kind == "float" and node.op in ("max", "min"):
+                    return op("Where", self._has_nan(x[0], option), math.nan, result)
                 return self.cast(result, "bool") if kind == "bool" else result
             case "cumsum":
                 return op("CumSum", x[0], np.array(option))
@@ -156,6 +223,11 @@ class _Writer:
                 result = op("TopK", numbers, size, axis=option, largest=0, results=2)[node.op == "argsort"]
                 return self.cast(result, "bool") if kind == "bool" else result
         return self._write_composed(node, x, kind)
+
+    def _has_nan(self, x: str, axes: Any) -> str:
+        """Add whether there is a NaN along these axes, which ONNX's reductions ignore."""
+        is_nan = self.cast(self.op("IsNaN", x), "int")
+        return self.cast(self.op("ReduceMax", is_nan, np.array(axes, int).reshape(-1), keepdims=0), "bool")
 
     def _write_rearrangement(self, node: Node, x: list[str], inputs: Sequence[Node]) -> str:
         op, option = self.op, node.option
@@ -201,14 +273,13 @@ class _Writer:
             case "power":
                 return op("Pow", *x) if kind == "float" else op("Pow", x[0], op("Max", x[1], np.array(0)))
             case "signbit":
-                return op("Less", x[0], np.zeros((), DTYPES[self.graph.nodes[node.inputs[0]].kind]))
+                is_float = self.graph.nodes[node.inputs[0]].kind == "float"
+                return _is_negative(op, x[0]) if is_float else op("Less", x[0], np.array(0))
             case "logaddexp" | "logaddexp2":
                 unit = 1.0 if node.op == "logaddexp" else math.log(2)
-                distance = op("Mul", op("Neg", op("Abs", op("Sub", *x))), unit)
+                distance = op("Where", op("Equal", *x), 0.0, op("Abs", op("Sub", *x)))  # infinities have no difference
+                distance = op("Mul", op("Neg", distance), unit)
                 return op("Add", op("Max", *x), op("Div", op("Log", op("Add", op("Exp", distance), 1.0)), unit))
-            case "copysign":
-                magnitude = op("Abs", x[0])
-                return op("Where", op("Less", x[1], 0.0), op("Neg", magnitude), magnitude)
             case "fmax" | "fmin":
                 both = op({"fmax": "Max", "fmin": "Min"}[node.op], *x)
                 if kind != "float":
@@ -217,8 +288,7 @@ class _Writer:
             case "fmod" if kind == "float":
                 return op("Mod", *x, fmod=1)
             case "floor_divide" | "remainder" if kind == "float":
-                quotient = op("Floor", op("Div", *x))
-                return quotient if node.op == "floor_divide" else op("Sub", x[0], op("Mul", x[1], quotient))
+                return self._write_float_division(node.op, *x)
             case "floor_divide" | "remainder" | "fmod":
                 zero = op("Equal", x[1], np.array(0))
                 divisor = op("Where", zero, np.array(1), x[1])
@@ -226,12 +296,19 @@ class _Writer:
                 result = op("Div", op("Sub", x[0], rest), divisor) if node.op == "floor_divide" else rest
                 return op("Where", zero, np.array(0), result)
             case "right_shift":
-                divisor = op("Pow", np.array(2), x[1])
+                divisor = _power_of_two(op, x[1])
                 return op("Div", op("Sub", x[0], op("Mod", x[0], divisor)), divisor)
-            case "arctan2":
-                side = op("Where", op("Less", x[0], 0.0), np.float32(-math.pi), np.float32(math.pi))
-                half = op("Mul", op("Sign", x[0]), math.pi / 2)
-                angle = op("Atan", op("Div", *x))
-                half_plane = op("Where", op("Equal", x[1], 0.0), half, op("Add", angle, side))
-                return op("Where", op("Greater", x[1], 0.0), angle, half_plane)
         raise NotImplementedError(node.op)
+
+    def _write_float_division(self, name: str, x: str, y: str) -> str:
+        """Add `floor_divide` or `remainder` of floats as NumPy computes them: the remainder first, which is exact."""
+        op = self.op
+        rest = op("Mod", x, y, fmod=1)
+        differs = op("Xor", op("Less", rest, 0.0), op("Less", y, 0.0))
+        rest = op("Where", op("And", differs, op("Not", op("Equal", rest, 0.0))), op("Add", rest, y), rest)
+        if name == "remainder":
+            return rest
+        quotient = op("Div", op("Sub", x, rest), y)
+        floor = op("Floor", quotient)
+        floor = op("Where", op("Greater", op("Sub", quotient, floor), 0.5), op("Add", floor, 1.0), floor)
+        return op("Where", op("Equal", y, 0.0), op("Div", x, y), floor)

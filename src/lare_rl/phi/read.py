@@ -115,6 +115,7 @@ def apply_program(source: str, observation: Array, action: Array) -> Array:
         The factors (rows, n_factors), with the batch axis 0.
     """
     interpreter = Interpreter(current_builder())
+    observation.read_only = action.read_only = True  # as in `read`
     interpreter.run(parse(source).body, interpreter.module)
     factors = interpreter.call(interpreter.module[FUNCTION_NAME], [observation, action], {})
     return concatenate(factors, 1)

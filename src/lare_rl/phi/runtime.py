@@ -13,7 +13,7 @@ from typing import Any
 from lare_rl.phi.arrays import Array
 from lare_rl.phi.builder import Builder
 from lare_rl.phi.limits import MAX_INT_BITS, MAX_KEY_LENGTH, MAX_LIST_LENGTH, MAX_STEPS, MAX_TEXT_LENGTH, RefusedError
-from lare_rl.phi.values import Instance, Scope, Set, Symbol
+from lare_rl.phi.values import Instance, Iterator, Scope, Set, Symbol
 
 __all__ = [
     "BINARY", "BUILTINS", "Meter", "Runtime", "builtin", "builtin_variants", "check_key", "check_number", "check_text",
@@ -102,6 +102,13 @@ class Runtime(ABC):
     line: int
     """Line of the present statement."""
     call_depth: int
+
+    def next_items(self, value: Any) -> Iterable[Any]:
+        """Return the entries that a loop goes through. A loop that is left early leaves the others in an iterator."""
+        if not isinstance(value, Iterator):
+            return self.items(value)
+        self.meter.pay(len(value) * (1 + len(value) // 100))
+        return value.read()
 
     @abstractmethod
     def run(self, statements: Iterable[ast.stmt], scope: Scope, /) -> None: ...

@@ -22,7 +22,6 @@ from lare_rl.phi.values import (
     Class,
     ContinueSignal,
     Instance,
-    Iterator,
     ProgramError,
     ReturnSignal,
     Scope,
@@ -65,7 +64,7 @@ def _execute(runtime: Runtime, statement: ast.stmt, scope: Scope) -> None:
             runtime.run(body if runtime.truth(runtime.evaluate(test, scope)) else orelse, scope)
         case ast.For(target=target, iter=iterable, body=body, orelse=orelse):
             value = runtime.evaluate(iterable, scope)
-            items = _next_items(runtime, value) if isinstance(value, Iterator) else runtime.items(value)
+            items = runtime.next_items(value)
             _loop(runtime, (runtime.assign(target, item, scope) for item in items), body, orelse, scope)
         case ast.While(test=test, body=body, orelse=orelse):
             _loop(runtime, _while_turns(runtime, test, scope), body, orelse, scope)
@@ -109,13 +108,6 @@ def _check_manager(runtime: Runtime, manager: ast.withitem, scope: Scope) -> Non
     function = runtime.evaluate(call.func if isinstance(call, ast.Call) else call, scope)
     if function not in IGNORED_MANAGERS or manager.optional_vars is not None:
         raise RefusedError("E-PYTHON", "with is available for np.errstate only")
-
-
-def _next_items(runtime: Runtime, iterator: Iterator) -> Iterable[Any]:
-    """Yield the entries of an iterator. A loop that is left early leaves the others in it."""
-    while iterator:
-        runtime.meter.pay(len(iterator) // 100)
-        yield iterator.pop(0)
 
 
 def _while_turns(runtime: Runtime, test: ast.expr, scope: Scope) -> Iterable[None]:
@@ -176,7 +168,9 @@ def _set_item(runtime: Runtime, container: Any, index: Any, value: Any) -> None:
     runtime.meter.pay_for_all_within([index, value])
     if isinstance(container, dict) and not isinstance(container, Set):
         container[check_key(index)] = value
-    elif isinstance(container, Array) or (isinstance(container, list) and not isinstance(index, slice)):
+    elif isinstance(container, list) and isinstance(index, slice):
+        raise RefusedError("E-PYTHON", "nothing can be written into a slice of a list")
+    elif isinstance(container, (Array, list)):
         container[index] = value
     else:
         raise TypeError(f"nothing can be written into {describe(container)}")

@@ -12,9 +12,9 @@ from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import Operand
 from lare_rl.phi.runtime import Meter, Runtime, check_key, check_text, check_text_length, make_set
-from lare_rl.phi.values import Set, Symbol, value_type
+from lare_rl.phi.values import Keys, Set, Symbol, value_type
 
-__all__ = ["METHODS", "call_method", "combine_values", "format_value", "represent_value"]
+__all__ = ["METHODS", "call_method", "combine_values", "convert_value", "format_value", "represent_value"]
 
 FORMAT = re.compile(r"[<>^=]?[-+ ]?#?0?\d{0,2}[,_]?(\.\d{1,2})?[bdeEfFgGnosxX%]?")
 """Format specifications of limited width."""
@@ -23,7 +23,8 @@ PERCENT = re.compile(r"%(%|[-+ #0]*\d{0,2}(\.\d{1,2})?[sdifeEgG])")
 METHODS: dict[type, frozenset[str]] = {
     str: frozenset(
         "upper lower strip lstrip rstrip split rsplit startswith endswith title capitalize isdigit isalpha removeprefix "
-        "removesuffix partition find count index replace join format zfill".split()
+        "removesuffix partition rpartition find rfind count index rindex replace join format zfill splitlines isalnum isdecimal "
+        "isnumeric isspace islower isupper casefold swapcase".split()
     ),
     list: frozenset("append extend insert pop copy index count reverse sort remove clear".split()),
     dict: frozenset("get items keys values pop update copy setdefault clear".split()),
@@ -34,7 +35,9 @@ METHODS: dict[type, frozenset[str]] = {
 
 def format_value(meter: Meter, value: Any, spec: str) -> str:
     """Return the text of a value: "<array>" for an array, unless it is constant."""
-    if isinstance(value, Array) and value.constant is not None and not spec:
+    if isinstance(value, Array) and value.constant is not None:
+        if spec and value.ndim:
+            raise RefusedError("E-PYTHON", "an array has no format: write each of its numbers")
         value = value.constant.tolist()
     if not FORMAT.fullmatch(spec):
         raise RefusedError("E-PYTHON", f"the format {spec[:40]!r} is not available")
@@ -42,6 +45,19 @@ def format_value(meter: Meter, value: Any, spec: str) -> str:
         meter.pay_for_all_within([value])
         return check_text(format(value, spec))
     return represent_value(meter, value)
+
+
+def convert_value(meter: Meter, value: Any, conversion: str | None) -> Any:
+    """Apply the conversion of a field: !s, !r or !a."""
+    if conversion == "s":
+        return format_value(meter, value, "")
+    if conversion == "r":
+        return represent_value(meter, value)
+    return (
+        check_text(ascii(value) if isinstance(value, str) else represent_value(meter, value))
+        if conversion == "a"
+        else value
+    )
 
 
 def represent_value(meter: Meter, value: Any) -> str:
@@ -65,8 +81,10 @@ def _represent(value: Any) -> str:
         return "<array>"
     if isinstance(value, (bool, int, float, str, Symbol, BatchSize)) or value is None:
         return repr(value) if isinstance(value, str) else str(value)
+    if isinstance(value, Keys):
+        return f"dict_keys([{', '.join(map(_represent, value))}])"
     if isinstance(value, Set):
-        return f"{{{', '.join(map(_represent, value))}}}" if value else "set()"
+        return f"{{{', '.join(map(_represent, value.entries))}}}" if value else "set()"
     if isinstance(value, dict):
         return f"{{{', '.join(f'{_represent(key)}: {_represent(entry)}' for key, entry in value.items())}}}"
     if isinstance(value, list):
@@ -131,11 +149,12 @@ def _text_method(runtime: Runtime, text: str, name: str, args: Sequence[Any], kw
 def _format_fields(runtime: Runtime, text: str, args: Sequence[Any], kwargs: dict[str, Any]) -> str:
     """Apply str.format. Its fields are numbers and names, without attributes and indices."""
     pieces, number = [], 0
-    for literal, field, spec, _ in string.Formatter().parse(text):
+    for literal, field, spec, conversion in string.Formatter().parse(text):
         pieces.append(literal)
         if field is not None:
             value = args[int(field or number)] if field.isdigit() or not field else kwargs[field]
             number += not field
+            value = convert_value(runtime.meter, value, conversion)
             pieces.append(format_value(runtime.meter, value, spec or ""))
             check_text_length(sum(map(len, pieces)))
     return check_text("".join(pieces))
@@ -164,7 +183,9 @@ def _dict_method(
         runtime.meter.pay_for_list(len(values))
         return None
     result = getattr(dict, name)(values, *args, **kwargs)
-    return list(result) if name in ("items", "keys", "values") else result
+    if name == "keys":
+        return Keys(dict.fromkeys(result))
+    return list(result) if name in ("items", "values") else result
 
 
 def _set_method(runtime: Runtime, values: Set, name: str, args: Sequence[Any]) -> Any:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable, Sequence
+import builtins
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from lare_rl.phi.batch_axis import BatchSize
+from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import Operand
 
 
@@ -94,9 +96,27 @@ class Instance(_Value):
 class Set(dict):
     """A set of the program. It keeps the order in which its entries were added."""
 
+    @property
+    def entries(self) -> list[Any]:
+        """The entries in the order of CPython, if all are numbers. That of texts differs from process to process."""
+        return list(set(self)) if all(isinstance(entry, (bool, int, float)) for entry in self) else list(self)
+
+
+class Keys(Set):
+    """The keys of a dictionary, in its order."""
+
+    @property
+    def entries(self) -> list[Any]:
+        return list(self)
+
 
 class Iterator(list):
     """The result of zip, map, a generator and the like. Its entries can be read once."""
+
+    def read(self) -> Iterable[Any]:
+        """Yield the entries. Those that are not read stay."""
+        while self:
+            yield self.pop(0)
 
 
 class Scope(dict):
@@ -115,7 +135,7 @@ class Scope(dict):
         """The object that the method is called on."""
 
     def find(self, name: str) -> Any:
-        """Return the value of a name. Raises `NameError` if it is not defined."""
+        """Return the value of a name. Raises `NameError` if it is not defined, `RefusedError` for a function of Python that is missing."""
         scope: Scope | None = self
         while scope is not None:
             if name in scope.elsewhere:
@@ -123,6 +143,8 @@ class Scope(dict):
             if name in scope:
                 return scope[name]
             scope = scope.parent
+        if hasattr(builtins, name):
+            raise RefusedError("E-PYTHON", f"{name} is not available")
         raise NameError(name)
 
     def assign(self, name: str, value: Any) -> None:
@@ -167,7 +189,8 @@ PYTHON_ERRORS = (ArithmeticError, AttributeError, LookupError, NameError, TypeEr
 """The errors that Python and NumPy would raise, too. A program can catch them; it cannot catch `RefusedError`."""
 
 _TYPE_NAMES: dict[type, str] = {
-    Set: "set", Iterator: "iterator", Bound: "function", Class: "type", BatchSize: "int", Symbol: "type", Function: "function",
+    Set: "set", Keys: "dict_keys", Iterator: "iterator", Bound: "function", Class: "type", BatchSize: "int", Symbol: "type",
+    Function: "function",
 }  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from lare_rl.phi.numpy_functions.registry import UFUNCS, as_numbers, as_operand,
 from lare_rl.phi.operand import Operand
 
 ALIASES = {
-    "abs": "absolute fabs", "remainder": "mod", "divide": "true_divide", "trunc": "fix", "arccos": "acos", "arcsin": "asin",
+    "abs": "absolute", "remainder": "mod", "divide": "true_divide", "trunc": "fix", "arccos": "acos", "arcsin": "asin",
     "arctan": "atan", "arctan2": "atan2", "arccosh": "acosh", "arcsinh": "asinh", "arctanh": "atanh",
     "left_shift": "bitwise_left_shift", "right_shift": "bitwise_right_shift",
 }  # fmt: skip
@@ -43,6 +43,7 @@ for _op in ELEMENTWISE:
 
 for _names, _function in {
     "power pow": power,
+    "fabs": lambda x: abs(x * 1.0),
     "float_power": lambda x, y: power(x * 1.0, y),
     "square": lambda x: power(x, 2),
     # An integer, such as 1 / 3, is cut to 0.

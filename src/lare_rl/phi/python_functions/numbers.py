@@ -4,7 +4,6 @@ import ast
 import functools
 import math
 import operator
-import re
 from collections.abc import Callable
 from typing import Any
 
@@ -20,11 +19,8 @@ SAME_IN_NUMPY = {
 }  # fmt: skip
 
 
-TEXTS: dict[type, str] = {
-    float: r"\s*[-+]?((\d{1,30}\.?\d{0,30}|\.\d{1,30})(e[-+]?\d{1,3})?|inf|infinity|nan)\s*",
-    int: r"\s*[-+]?\d{1,18}\s*",
-}
-"""What a text of a number looks like, in upper or lower case."""
+MAX_DIGITS = 1000
+"""Characters of a text that becomes a number."""
 
 
 @builtin_variants({"float": float, "int": int})
@@ -34,8 +30,8 @@ def number(kind: type, _: Runtime, /, x: Any = 0) -> Any:
         x.refuse()
     if varies([x]):
         raise RefusedError("E-FLOW", f"{name}() of numbers that differ from row to row: use astype({name})")
-    if isinstance(x, str) and not re.fullmatch(TEXTS[kind], x, re.IGNORECASE):
-        raise ValueError(f"{name}() of {x[:40]!r}")
+    if isinstance(x, str) and len(x) > MAX_DIGITS:
+        raise RefusedError("E-COST", f"{name}() of a text with more than {MAX_DIGITS} characters")
     if not isinstance(x, (bool, int, float, str, Array)):
         raise TypeError(f"{name}() of a value that is no number")
     return check_number(kind(x))
@@ -43,6 +39,8 @@ def number(kind: type, _: Runtime, /, x: Any = 0) -> Any:
 
 @builtin("round")
 def round_(_: Runtime, x: Any, ndigits: Any = None) -> Any:
+    if isinstance(x, Array) and x.is_number and ndigits is None:
+        x = x.number()
     if isinstance(x, Operand):
         return call_numpy("round", [x, ndigits or 0], {})
     return round(x) if ndigits is None else round(x, max(-30, min(operator.index(ndigits), 30)))

@@ -7,10 +7,11 @@ import numpy as np
 
 from lare_rl.phi.arrays import Array, as_array
 from lare_rl.phi.limits import RefusedError
+from lare_rl.phi.numpy_functions import FUNCTIONS
 from lare_rl.phi.numpy_functions.registry import KIND_OF_DTYPE, astype, dtype_kind, dtype_name
 from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, check_text
 from lare_rl.phi.text import format_value
-from lare_rl.phi.values import Bound, Class, Decorated, Function, Instance, Symbol, value_type
+from lare_rl.phi.values import Bound, Class, Decorated, Function, Instance, Iterator, Keys, Set, Symbol, value_type
 
 _EXCEPTIONS: list[type[Exception]] = [
     Exception, ValueError, TypeError, IndexError, KeyError, LookupError, ZeroDivisionError, ArithmeticError, AttributeError,
@@ -19,11 +20,15 @@ _EXCEPTIONS: list[type[Exception]] = [
 ERRORS = {cls.__name__: [base.__name__ for base in cls.__mro__] for cls in _EXCEPTIONS}
 """The errors that a program can raise and catch, and the classes above them."""
 
-_SEQUENCE = ["collections.abc.Sequence", "typing.Sequence", "collections.abc.Iterable", "typing.Iterable"]
+_ITERABLE = ["collections.abc.Iterable", "typing.Iterable"]
+_SEQUENCE = ["collections.abc.Sequence", "typing.Sequence", *_ITERABLE]
+_MAPPING = ["collections.abc.Mapping", "typing.Mapping", *_ITERABLE]
+_CALLABLE = ["collections.abc.Callable", "typing.Callable"]
 _REAL = ["numbers.Number", "numbers.Real"]
 _PARENTS = {
     "bool": ["int", *_REAL, "numbers.Integral"], "int": [*_REAL, "numbers.Integral"], "float": _REAL, "list": _SEQUENCE,
-    "tuple": _SEQUENCE, "dict": ["collections.abc.Mapping", "typing.Mapping"], "function": ["collections.abc.Callable"],
+    "tuple": _SEQUENCE, "str": _SEQUENCE, "range": _SEQUENCE, "set": _ITERABLE, "iterator": _ITERABLE, "dict_keys": _ITERABLE,
+    "dict": _MAPPING, "function": _CALLABLE, "np.ndarray": _ITERABLE, "type": _CALLABLE,
 }  # fmt: skip
 """The types above a type."""
 _NUMPY_SCALARS = {
@@ -33,12 +38,27 @@ _NUMPY_SCALARS = {
 """The types of NumPy's numbers: float64 is a float of Python, too."""
 
 
+_INDISTINCT = frozenset("frozenset map filter zip enumerate reversed".split())
+"""Types whose values a program has as a `Set` or an `Iterator`."""
+_PYTHON_TYPES: dict[type, type] = {
+    Set: set, Keys: type({}.keys()), Iterator: type(iter([])),
+    **{cls: cls for cls in (str, list, tuple, dict, range, bool, int, float, complex, slice, type(None))},
+}  # fmt: skip
+"""The types of Python that the types of values stand for."""
+
+
 @builtin("isinstance")
 def isinstance_(_: Runtime, value: Any, classes: Any) -> bool:
     classes = classes if isinstance(classes, tuple) else (classes,)
     if isinstance(value, Instance):
         types = [value.cls, *value.cls.bases, Symbol("object"), *([Symbol("tuple")] if value.cls.is_tuple else [])]
         return any(cls in classes for cls in types)
+    if isinstance(value, (Set, Iterator)) and any(
+        isinstance(cls, Symbol) and cls.name in _INDISTINCT for cls in classes
+    ):
+        raise RefusedError(
+            "E-PYTHON", "isinstance() cannot tell such types apart: set and frozenset, or kinds of iterators"
+        )
     name = value_type(value).name
     names = [name, "object", *_PARENTS.get(name, ())]
     if isinstance(value, Array) and value.is_number:
@@ -56,8 +76,9 @@ def hasattr_(runtime: Runtime, value: Any, name: str) -> bool:
         return value.has(name)
     try:
         runtime.attribute(value, name)
-    except (RefusedError, AttributeError):
-        return False
+    except (RefusedError, AttributeError):  # it may be one that Python's or NumPy's type has
+        python_type = np.ndarray if isinstance(value, Array) else _PYTHON_TYPES.get(type(value))
+        return name in dir(python_type) if python_type else False
     return True
 
 
@@ -110,6 +131,14 @@ def vectorize(runtime: Runtime, pyfunc: Any, otypes: Any = None, doc: Any = None
     return Bound(call)
 
 
+def _is_callable(value: Any) -> bool:
+    if isinstance(value, Instance):
+        return value.cls.has("__call__")
+    if isinstance(value, Symbol):
+        return value.name in BUILTINS or value.name.removeprefix("np.") in FUNCTIONS
+    return isinstance(value, (Function, Bound, Class))
+
+
 def _conversion(dtype: str) -> Callable[..., Any]:
     return lambda _, x=0: astype(x, dtype)
 
@@ -117,7 +146,7 @@ def _conversion(dtype: str) -> Callable[..., Any]:
 BUILTINS |= {
     "type": lambda _, value: value.cls if isinstance(value, Instance) else value_type(value),
     "object": lambda _: Instance(Class("object", {})),
-    "callable": lambda _, value: isinstance(value, (Function, Bound, Class)) or getattr(value, "name", "") in BUILTINS,
+    "callable": lambda _, value: _is_callable(value),
     "types.SimpleNamespace": lambda _, **attributes: Instance(Class("SimpleNamespace", {}), attributes),
     "dataclasses.field": lambda _, *, default=None, default_factory=None, **more: (
         default if default_factory is None else Decorated("default_factory", default_factory)
