@@ -3,10 +3,11 @@ import json
 import numpy as np
 import pytest
 
-from lare_rl.compare.collect import select_runs
+from lare_rl.compare.collect import collect_results, select_runs
 from lare_rl.compare.comparison import compare
 from lare_rl.compare.labels import label_runs
 from lare_rl.compare.messages import MESSAGES, find_min_p, find_small_samples, to_text
+from lare_rl.compare.metric_tables import read_metric_rows, write_table
 from lare_rl.compare.page import comparison_table, describe, write_comparisons
 from lare_rl.compare.results import read_run_results
 from lare_rl.errors import LareError
@@ -46,6 +47,23 @@ def test_command(make_run, command, tmp_path):
     assert status == 0
     assert "three quarters of 50 steps" in out
     assert "three quarters of 50 steps" in (tmp_path / "late.html").read_text()
+    config = runs[0].directory / "config.json"
+    for out, content in ((".", "not the name of a file"), (config, "configuration of a run")):
+        status, _, error = command("compare", *paths, "--out", out)
+        assert (status, error.count("\n"), content in error) == (2, 1, True)
+    assert config.read_text().startswith("{")
+
+
+def test_outputs_of_a_sweep_among_its_runs(make_run, command, tmp_path):
+    """DIRECTORY/* has the tables and the pages of LaRe, too."""
+    runs = [make_run("a", [1.0, 3.0]), make_run("b", [2.0, 4.0], method="rd")]
+    write_table(read_metric_rows([run.directory for run in runs]), tmp_path / "results")
+    (tmp_path / "compare.html").touch()
+    outputs = sorted(path for path in tmp_path.iterdir() if path.is_file())
+    assert {path.name for path in outputs} >= {"results.csv", "compare.html"}
+    results, _ = collect_results([tmp_path / "runs", *outputs])
+    assert results == read(runs)
+    assert len(collect_results([tmp_path / "results.csv"])[0]) == 4
 
 
 def test_comparison_table(make_run):
@@ -62,7 +80,7 @@ def test_comparison_table(make_run):
 
 
 def test_smallest_p(make_run):
-    """Two seeds above two others, or below them: two of the six ways to deal four numbers."""
+    """Two seeds above two outputs, or below them: two of the six ways to deal four numbers."""
     runs = [make_run("a", [1.0, 2.0]), make_run("b", [3.0, 4.0], method="rd"), make_run("c", [0.0, 0.5], method="rrdu")]
     comparison = compare(read(runs))
     _, better, worse = comparison.rows

@@ -82,6 +82,7 @@ def test_same_seed_twice(write_csv, run):
         ("a,T,0.5,5,1,x\n", HEADER, "line 2: seed '0.5'"),
         ("a,T,0,-5,1,x\n", HEADER, "line 2: step '-5'"),
         ("a,T,0,5,1,x\na,T,0,10,nan,x\n", HEADER, "line 3: evaluation/return 'nan'"),
+        ("a,T,0,5,1e200,x\n", HEADER, "line 2: evaluation/return '1e200'"),
         ("a" * 200_000 + ",T,0,5,1,x\n", HEADER, "not a CSV table"),
         ("a,T,0,5,1,x\n" * 2, HEADER, "line 3 is a second row of a on T with seed 0 at step 5"),
     ],

@@ -77,6 +77,13 @@ def test_objects_are_refused_before_the_fit(infos, tmp_path):
         log.check_output(tmp_path / "new", False)
 
 
+def test_output_with_the_suffix_of_a_file_is_refused(tmp_path):
+    log = open_log(list(logged_episodes(1)))
+    for name in ("new.npz", "new.parquet"):
+        with pytest.raises(LareError, match=r"becomes a directory of \.npz files"):
+            log.check_output(tmp_path / name, False)
+
+
 def test_large_and_pickled_files_are_refused(folder, monkeypatch):
     path = folder([])
     np.savez_compressed(path / "0.npz", **next(logged_episodes(1)))

@@ -71,6 +71,23 @@ def test_metrics_that_cannot_be_truncated(tmp_path):
         truncate_metrics(tmp_path, 0)
 
 
+@pytest.mark.parametrize("ends", [(b"\n", b"\r\n"), (b"}\n", b"} }")])
+def test_metrics_that_another_program_has_changed(ends, run):
+    n_bytes = append_metrics(run.directory, [{"step": 50, "seed": 0, "evaluation/return": 1.0}] * 2)
+    path = run.directory / "metrics.jsonl"
+    path.write_bytes(changed := path.read_bytes().replace(*ends) + b"more")
+    with pytest.raises(LareError, match=r"was changed since the checkpoint.*restore it"):
+        truncate_metrics(run.directory, n_bytes)
+    assert path.read_bytes() == changed
+
+
+@pytest.mark.parametrize("value", ["NaN", "-Infinity", "1e200"])
+def test_metrics_that_are_no_numbers(value, run):
+    (run.directory / "metrics.jsonl").write_text(f'{{"step": 50, "seed": 0, "evaluation/return": {value}}}\n')
+    with pytest.raises(LareError, match="line 1 is no"):
+        run.metrics()
+
+
 def test_metrics_have_a_meaning_and_the_lock_refuses_a_second_process(run):
     metric, files = (
         r'"((?:algorithm|evaluation|credit|critic|actor|time)/\w+)"',
@@ -92,6 +109,10 @@ def test_find_run_directories(make_run, tmp_path):
     both = [first.directory, second.directory]
     assert find_run_directories([tmp_path / "runs"]) == both
     assert find_run_directories([tmp_path / "runs" / "Chase"]) == both
+    (tmp_path / "study").mkdir()
+    (tmp_path / "runs").rename(tmp_path / "study" / "runs")
+    assert len(find_run_directories([tmp_path / "study"])) == 2
+    (tmp_path / "study" / "runs").rename(tmp_path / "runs")
     directories = find_run_directories([second.directory, first.directory / ".." / ".." / "Chase"])
     assert [path.resolve() for path in directories] == both[::-1]
 

@@ -271,6 +271,10 @@ def test_end_of_process(file, python_script, script, error):
         (("[settings]", "[settings]\nsac = { gamma = 0.9 }"), r"sac\.gamma.*td3\.gamma"),
         (("[settings]", "[settings]\ncredit = { sum_form = true }"), r"no run uses credit\.sum_form.*dense"),
         ((', "lare-linear"', ""), "draws"),
+        (
+            ("[settings]", "[functions]\nReacher-v4 = []\n[settings]"),
+            r"functions\.Reacher-v4 = \[\].*should not be empty",
+        ),
         ((FUNCTIONS[0], f"{FUNCTIONS[0]}\n{FUNCTIONS[1]}"), r"draws .*\[functions\]"),
         (("rollout_steps = 50", "candidates = 3"), r"Reacher-v4.*reply 1"),
         (("rollout_steps = 50", "capacity = 40"), "capacity = 40"),

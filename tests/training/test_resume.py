@@ -131,11 +131,17 @@ def test_finished_run_and_missing_files(dense_run, tmp_path):
     assert any("complete" in message for message in listener.messages)
     with pytest.raises(LareError, match=r"steps = 228.*only be increased.*continue"):
         resume_quietly(run, steps=228)
+    best = run.checkpoint / "best.npz"
+    best.write_bytes(b"damaged")
+    listener.messages.clear()
+    resume_quietly(run, listeners=[listener])
+    assert any("best policies so far are lost" in message for message in listener.messages)
     path = run.directory / "metrics.jsonl"
     text = path.read_text()
     path.write_text(text.splitlines(keepends=True)[0])
     with pytest.raises(LareError, match=f"bytes, and the checkpoint needs {len(text)}"):
-        resume_quietly(run)
+        resume_quietly(run, steps=100_000)
+    assert open_run(run.directory).config == run.config  # not extended
     path.write_text(text)
     shutil.rmtree(run.checkpoint)
     with pytest.raises(LareError, match="no checkpoint any more"):

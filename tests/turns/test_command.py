@@ -61,6 +61,11 @@ def test_command(command, tmp_path, file, rollouts):
     status, _, error = command("turn-credit", file, "--out", tmp_path / "new", "--report", tmp_path / "new")
     assert (status, "another --report" in error) == (2, True)
     assert not (tmp_path / "new").exists()
+    for option, path in (("--report", file), ("--report", phi), ("--out", phi)):
+        files = {"--out": tmp_path / "new", "--report": tmp_path / "page"} | {option: path}
+        content, flags = path.read_bytes(), [word for pair in files.items() for word in pair]
+        status, _, error = command("turn-credit", file, *flags, "--function", phi, "--overwrite")
+        assert (status, f"another {option}" in error, path.read_bytes() == content) == (2, True, True)
 
 
 @pytest.mark.parametrize(

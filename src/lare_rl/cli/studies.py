@@ -14,6 +14,7 @@ from lare_rl.cli.terminal import RunDirectories, print_line, print_progress, pri
 from lare_rl.errors import LareError
 from lare_rl.runs.metric_names import RETURN
 from lare_rl.sweep.resources import Resources, assign_slots
+from lare_rl.util.files import check_new_path
 
 _BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
 """A directory of the checkout. It does not exist if LaRe was installed from a package index."""
@@ -91,8 +92,12 @@ def compare(
     from lare_rl.compare.collect import collect_results
     from lare_rl.compare.messages import MESSAGES
     from lare_rl.compare.scores import ScoreChoice
+    from lare_rl.config.migrate import CONFIG
     from lare_rl.util.findings import render
 
+    check_new_path(out, "--out", overwrite=True)
+    if out.name == CONFIG:
+        raise LareError(f"{out} is the configuration of a run: choose another --out")
     results, findings = collect_results(runs, metric)
     for finding in findings:
         print_progress(render(finding, MESSAGES))

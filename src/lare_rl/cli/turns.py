@@ -44,8 +44,10 @@ def turn_credit(
     check_new_path(out, "--out", overwrite)
     if report is not None:
         check_new_path(report, "--report", overwrite)
-        if report.resolve() == out.resolve():
-            raise LareError(f"--out writes {out} too: choose another --report")
+    inputs = [path.resolve() for path in (rollouts, function) if path is not None]
+    for option, path, used_paths in (("--out", out, inputs[1:]), ("--report", report, [out.resolve(), *inputs])):
+        if path is not None and path.resolve() in used_paths:
+            raise LareError(f"{option} {path} is another file of this command: choose another {option}")
     phi = None if function is None else load_turn_phi(function)
     credit = TurnCredit(lambda_)
     contents = read_rollout_file(rollouts)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lare_rl.compare.labels import find_differences, find_origin_differences, label_runs
+from lare_rl.compare.metric_tables import is_sweep_table
 from lare_rl.compare.results import LearningCurve, group_pairs, read_results_table, read_run_results
 from lare_rl.errors import LareError, did_you_mean
 from lare_rl.runs.directory import Run, find_run_directories, open_without_functions
@@ -22,8 +23,10 @@ def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[L
 
     Raises `LareError` if a path has nothing to compare, or a file is damaged.
     """
-    tables = [path for path in paths if path.suffix.lower() == ".csv"]
+    tables = [path for path in paths if path.suffix.lower() == ".csv" and not path.is_dir()]
     directories = [path for path in paths if path not in tables]
+    if directories:  # DIRECTORY/* of a sweep has its table, too
+        tables = [path for path in tables if not is_sweep_table(path)]
     runs, findings = [], []
     if directories or not tables:
         runs, findings = select_runs(list(map(open_without_functions, find_run_directories(directories))), metric)

@@ -1,5 +1,6 @@
 """The metrics of many runs as one table on the disk, in CSV and Parquet."""
 
+import contextlib
 import csv
 import io
 from collections.abc import Callable, Iterable, Sequence
@@ -11,10 +12,12 @@ from lare_rl.runs.config_file import CONFIG, read_config
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.util.files import write_atomically, write_bytes
 
-__all__ = ["read_metric_rows", "write_table"]
+__all__ = ["is_sweep_table", "read_metric_rows", "write_table"]
 
 KEYS = ("task", "run", "method", "algorithm", "scored_observation", "draw", "seed", "step")
 """The first columns of the table."""
+MAX_HEADER = 10_000
+"""Characters of a first line that are read."""
 
 
 def read_metric_rows(
@@ -46,6 +49,13 @@ def read_metric_rows(
         }
         rows += [keys | line for line in lines]
     return rows
+
+
+def is_sweep_table(path: Path) -> bool:
+    """Return whether a .csv file has the first columns of `write_table`."""
+    with contextlib.suppress(OSError, UnicodeDecodeError), path.open(encoding="utf-8") as file:
+        return file.readline(MAX_HEADER).startswith(",".join(KEYS))
+    return False
 
 
 def write_table(rows: Sequence[dict[str, Any]], path: Path) -> list[Path]:

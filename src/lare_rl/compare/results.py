@@ -6,7 +6,6 @@ columns are ignored.
 
 import csv
 import io
-import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from typing import TypeVar
 from lare_rl.errors import LareError, did_you_mean, short_repr
 from lare_rl.runs.config_file import Config
 from lare_rl.runs.directory import Run
+from lare_rl.runs.metrics_file import MAX_VALUE
 from lare_rl.util.safe_io import read_text
 
 __all__ = ["LearningCurve", "group_pairs", "read_results_table", "read_run_results"]
@@ -141,6 +141,6 @@ def _parse_count(text: str) -> int:
 def _parse(where: str, text: str | None, convert: Callable[[str], _Number], kind: str) -> _Number:
     with suppress(ValueError, OverflowError):
         value = convert(text or "")
-        if math.isfinite(value):
+        if abs(value) <= MAX_VALUE:
             return value
     raise LareError(f"{where} {short_repr(text)} is not a {kind} number")

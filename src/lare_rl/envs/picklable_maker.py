@@ -5,6 +5,7 @@ from collections.abc import Callable
 from functools import partial
 
 import gymnasium
+from gymnasium.envs.registration import EnvSpec as RegistryEntry
 
 from lare_rl.envs.env_errors import close_env
 from lare_rl.envs.families import FAMILIES, GYMNASIUM, Family, find_family, make_local_env
@@ -26,13 +27,13 @@ def picklable_maker(task: TaskSpec) -> Callable[[], HostEnv]:
     return partial(_import_and_make, family, task, _describe_entry(registry_entry(task)))
 
 
-def registry_entry(task: TaskSpec) -> gymnasium.envs.registration.EnvSpec | None:
+def registry_entry(task: TaskSpec) -> RegistryEntry | None:
     """Return the entry of a task's environment in Gymnasium's registry. None if there is none, or its module was not imported."""
     _, name = split_environment(task.environment)
     return gymnasium.registry.get(name) if find_family(task) is GYMNASIUM else None
 
 
-def _describe_entry(entry: gymnasium.envs.registration.EnvSpec | None) -> tuple[str, int | None] | None:
+def _describe_entry(entry: RegistryEntry | None) -> tuple[str, int | None] | None:
     """Return the maker and the time limit of a registered environment, for a comparison with another process."""
     if entry is None:
         return None

@@ -11,7 +11,7 @@ import numpy as np
 from lare_rl.assigner.space_layout import to_array
 from lare_rl.errors import LareError, short_repr
 from lare_rl.logs.episode import KEYS, RelabelledEpisode
-from lare_rl.logs.log import Log, atomic_output, list_files
+from lare_rl.logs.log import LOG_SUFFIXES, Log, atomic_output, list_files
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.files import write_npz
 from lare_rl.util.npz import open_npz
@@ -26,6 +26,13 @@ MAX_EPISODE_BYTES = 8 << 30
 
 class ArrayLog(Log):
     """A log whose episodes are mappings of arrays. It is written as a directory of .npz files."""
+
+    def check_output(self, out: str | Path, overwrite: bool) -> None:
+        super().check_output(out, overwrite)
+        if (suffix := Path(out).suffix) in LOG_SUFFIXES:
+            raise LareError(
+                f"{out} cannot be written: this log becomes a directory of .npz files, whose name has no {suffix}"
+            )
 
     def write(self, out: str | Path, episodes: Iterable[RelabelledEpisode], overwrite: bool, comment: str) -> Path:
         with atomic_output(Path(out), overwrite) as directory:

@@ -112,7 +112,7 @@ def check_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> No
 
 def list_files(directory: Path, suffix: str) -> list[Path]:
     """Return the files of a log in the order of their names, without hidden files, such as those in archives of macOS."""
-    return sorted(path for path in directory.glob(f"*{suffix}") if not path.name.startswith("."))
+    return sorted(path for path in directory.glob(f"*{suffix}") if path.is_file() and not path.name.startswith("."))
 
 
 @contextlib.contextmanager

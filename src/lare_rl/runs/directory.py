@@ -47,6 +47,8 @@ __all__ = [
 ]
 
 CHECKPOINT = "checkpoint"
+OUTPUT_SUFFIXES = frozenset({".log", ".csv", ".parquet", ".html"})
+"""Files that LaRe writes beside runs."""
 
 
 class RunBusyError(LareError):
@@ -121,9 +123,9 @@ def create_run(directory: Path, task: TaskSpec, settings: ResolvedSettings, func
 
 
 def extend_run(run: Run, steps: int) -> Run:
-    """Return the run with a larger number of steps, rounded up to whole iterations, and write that to config.json.
+    """Return the run with a larger number of steps, rounded up to whole iterations. Nothing is written.
 
-    Raises `LareError` if the number is smaller than before, or the file cannot be written.
+    Raises `LareError` if the number is smaller than before.
     """
     settings = run.config.settings
     steps = round_up(steps, settings.iteration_steps)
@@ -135,9 +137,8 @@ def extend_run(run: Run, steps: int) -> Run:
             "leave the steps out"
         )
     extended = ResolvedSettings(**{**dict(settings), "steps": steps})
-    config = run.config.model_copy(update={"settings": extended, "ended_at": (*run.config.ended_at, settings.steps)})
-    write_config(run.directory, config)
-    return replace(run, config=config)
+    changes = {"settings": extended, "ended_at": (*run.config.ended_at, settings.steps)}
+    return replace(run, config=run.config.model_copy(update=changes))
 
 
 def open_run(directory: str | Path) -> Run:
@@ -230,19 +231,20 @@ def lock_run(run: Run) -> Iterator[None]:
 
 
 def find_run_directories(paths: Sequence[Path]) -> list[Path]:
-    """Return the runs among some paths and up to two levels below them, in the order of the paths, each once.
+    """Return the runs among some paths and up to three levels below them, in the order of the paths, each once.
 
-    Logs that a sweep writes beside its runs are skipped, so that `DIRECTORY/*` may be passed. The log of a run that never began is
-    skipped unless it is the only path.
+    What LaRe writes beside runs (logs, tables, pages) is skipped, so that `DIRECTORY/*` may be passed; but not a path that is the only
+    one, unless it is the log of a run.
 
     Raises `LareError` if there is no path, or a path contains no run.
     """
     directories: dict[Path, Path] = {}  # by resolved path
     for path in paths:
-        if path.suffix == ".log" and path.is_file() and (len(paths) > 1 or path.with_suffix("").is_dir()):
+        is_log_of_run = path.suffix == ".log" and path.with_suffix("").is_dir()
+        if path.is_file() and (is_log_of_run or (len(paths) > 1 and path.suffix in OUTPUT_SUFFIXES)):
             continue
         # The directory of a run that was killed while it was created has a name that begins with a dot.
-        configs = [config for depth in ("", "[!.]*/", "[!.]*/[!.]*/") for config in path.glob(depth + CONFIG)]
+        configs = [config for depth in range(4) for config in path.glob("[!.]*/" * depth + CONFIG)]
         if not configs:
             hint = "; give the directory of a run (lare-rl compare also reads .csv files: docs/how-to/sweeps.md)"
             raise LareError(f"{path} is not a run, and contains none{hint if path.is_file() else ''}")

@@ -12,12 +12,14 @@ from lare_rl.util.files import report_write_error
 from lare_rl.util.renamed_fields import rename_metrics
 from lare_rl.util.safe_io import read_json, read_text
 
-__all__ = ["append_metrics", "is_count", "read_metrics", "truncate_metrics"]
+__all__ = ["MAX_VALUE", "append_metrics", "is_count", "read_metrics", "truncate_metrics"]
 
 METRICS_FILE = "metrics.jsonl"
 MAX_METRICS_BYTES = 512 << 20
 MAX_INTEGER = 2**53
 """A larger whole number may change when it becomes a float."""
+MAX_VALUE = 1e100
+"""The largest metric. The square of a larger one may be infinite."""
 
 
 def read_metrics(directory: Path) -> list[dict[str, Any]]:
@@ -48,13 +50,18 @@ def append_metrics(directory: Path, lines: Sequence[dict[str, Any]]) -> int:
 def truncate_metrics(directory: Path, n_bytes: int) -> None:
     """Remove the lines that were written after a checkpoint. Resumed training writes them again.
 
-    Raises `LareError` if lines from before the checkpoint are missing, or the file cannot be written.
+    Raises `LareError` if lines from before the checkpoint are missing or changed, or the file cannot be written.
     """
     path = directory / METRICS_FILE
-    size = path.stat().st_size if path.exists() else 0
-    if size < n_bytes:
-        raise LareError(f"{path} has {size} bytes, and the checkpoint needs {n_bytes}: was it copied during training?")
-    if size > n_bytes:
+    with report_write_error(path):
+        content = path.read_bytes() if path.exists() else b""
+    if len(content) < n_bytes:
+        raise LareError(
+            f"{path} has {len(content)} bytes, and the checkpoint needs {n_bytes}: was it copied during training? Copy the run again"
+        )
+    if b"\r\n" in content or (n_bytes and content[n_bytes - 1 : n_bytes] != b"\n"):
+        raise LareError(f"{path} was changed since the checkpoint (by Windows line ends?): restore it")
+    if len(content) > n_bytes:
         with report_write_error(path):
             os.truncate(path, n_bytes)
 
@@ -79,11 +86,16 @@ def is_count(value: Any) -> bool:
     return type(value) is int and 0 <= value <= MAX_INTEGER
 
 
+def is_metric(value: Any) -> bool:
+    """Return whether a value of JSON is a number that a metric can have."""
+    limits = {int: MAX_INTEGER, float: MAX_VALUE}
+    return type(value) in limits and abs(value) <= limits[type(value)]  # false for NaN
+
+
 def _is_evaluation(line: Any) -> bool:
     """Return whether a value is an object with a step, a seed, and numbers or null."""
     return (
         isinstance(line, dict)
         and all(is_count(line.get(name)) for name in ("step", "seed"))
-        and all(value is None or type(value) in (int, float) for value in line.values())
-        and all(abs(value) <= MAX_INTEGER for value in line.values() if type(value) is int)
+        and all(value is None or is_metric(value) for value in line.values())
     )

@@ -26,7 +26,7 @@ __all__ = ["FunctionPaths", "RunPlan", "load_config"]
 
 
 FunctionPaths = Annotated[
-    tuple[Path, ...], BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)
+    tuple[Path, ...], Field(min_length=1), BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)
 ]
 """The files of latent functions in a file: one path, or a list with one for each team."""
 

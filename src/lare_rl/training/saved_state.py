@@ -48,6 +48,8 @@ def load_learner(run: Run, n_devices: int = 1) -> SavedState:
     Raises:
         LareError: there is no checkpoint, it is damaged, or it is of a version of LaRe whose state has another structure.
     """
+    if not run.has_checkpoint():
+        raise LareError(f"there is no checkpoint in {run.directory}")
     config = make_run_config(run, n_devices)
     try:
         learner, metadata, arrays = checkpoint.load(run.checkpoint, learner_shape(config, len(run.seeds)))

@@ -274,15 +274,22 @@ class Session:
         self.step, self.metrics_bytes = metadata["step"], metadata["metrics_length"]
         self.first_fit_done = metadata.get("fitted", False)
         self.latest_metrics = jax.device_put(_select_prefix(arrays, "latest/"))
-        if (self.run.checkpoint / BEST_FILE).exists():
-            n_seeds = len(self.run.seeds)
-            self.best = load_best(self.run.checkpoint, actor_shape(self.config, n_seeds), n_seeds)
-        dropped, messages = self.collector.restore(_select_prefix(arrays, "collector/"))
+        messages = self._restore_best() if (self.run.checkpoint / BEST_FILE).exists() else []
+        dropped, lost_episodes = self.collector.restore(_select_prefix(arrays, "collector/"))
         if dropped.any():
             self.learner = jax.jit(jax.vmap(abandon_episodes))(self.learner, jnp.asarray(dropped))
             self.save()  # now, because a new episode will overwrite rows that the checkpoint counts as saved
             self.finish_saving()
-        return messages
+        return messages + lost_episodes
+
+    def _restore_best(self) -> list[str]:
+        """Restore the best policies. Training does not need them: if they cannot be read, it goes on without those so far."""
+        n_seeds = len(self.run.seeds)
+        try:
+            self.best = load_best(self.run.checkpoint, actor_shape(self.config, n_seeds), n_seeds)
+        except LareError as error:
+            return [f"the best policies so far are lost, and the next evaluations choose new ones: {error}"]
+        return []
 
     def close(self) -> None:
         """Close the environments and worker processes, and finish the last checkpoint. Raises `LareError` if it cannot be written."""

@@ -15,7 +15,7 @@ from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError, short_repr
-from lare_rl.runs.config_file import read_config
+from lare_rl.runs.config_file import read_config, write_config
 from lare_rl.runs.directory import Run, as_run, create_run, default_directory, extend_run, lock_run
 from lare_rl.runs.metric_names import ACTOR_SATURATION, RETURN, was_updated
 from lare_rl.runs.metrics_file import append_metrics, truncate_metrics
@@ -175,6 +175,7 @@ def _run_to_end(
             session.save()  # so that there is always a checkpoint
         else:
             truncate_metrics(run.directory, session.metrics_bytes)
+        write_config(run.directory, run.config)  # an extension is written only after the run could be restored
         if tensorboard:
             listeners = [*listeners, TensorBoard(run.directory / EVENTS_DIRECTORY, session.step, run.seeds)]
         messages = [*messages, *restore_messages, *_introduction(session, earlier_steps)]
