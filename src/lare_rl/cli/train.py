@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from lare_rl.training.progress import Listener
 
 DEFAULTS = Settings()
+RUN_SETTINGS = "environments", "rollout_steps", "evaluate_every", "fit_updates", "capacity"
+"""Settings whose defaults the algorithm chooses."""
 
 _READ_PLAN = PrimitiveConstructorSpec(
     nargs=1,
@@ -103,6 +105,9 @@ def _prepare(
 
     spec = resolve_task(task)
     resolved = resolve(settings, spec)
+    if plan.is_run and resolved.algorithm != plan.settings.algorithm:
+        names = ", ".join(f"{name} = {getattr(resolved, name)}" for name in RUN_SETTINGS)
+        print_progress(f"from the run, which was trained with {plan.settings.algorithm}: {names}")
     for name, warning in describe_unused_settings(settings, resolved, spec).items():
         # The configuration of a repeated run holds every setting, so a setting without effect is no mistake of the user.
         if not (plan.is_run and plan.has_same_value(name, settings)):
