@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from lare_rl.compare.messages import MESSAGES, find_min_p, find_small_samples, t
 from lare_rl.compare.metric_tables import read_metric_rows, write_table
 from lare_rl.compare.page import comparison_table, describe, write_comparisons
 from lare_rl.compare.results import read_run_results
+from lare_rl.envs.load import read_task
 from lare_rl.errors import LareError
 from lare_rl.runs.metric_names import RETURN
 
@@ -135,6 +137,9 @@ def test_select_runs_with_metric(make_run):
     selected, findings = select_runs([with_error, without], "credit/error")
     assert (selected, codes(findings)) == ([with_error], ["no_metric"])
     assert codes(select_runs([with_error])[1]) == ["mean_over_agents"]
+    teams = read_task("CompetitivePP-6")
+    (finding,) = select_runs([replace(without, config=without.config.model_copy(update={"task": teams}))])[1]
+    assert finding.values["teams"] == ("evaluation/return_predator", "evaluation/return_prey")
     with pytest.raises(LareError, match="'credit/error'; they have critic/loss, evaluation/return"):
         select_runs([without], "credit/error")
     write(without, None)

@@ -80,6 +80,12 @@ def select_runs(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], l
     findings += [Finding("no_metric", {"run": run.directory, "metric": metric}) for run in without_metric]
     if metric == RETURN and SUMMED_RETURN in names:
         findings.append(Finding("mean_over_agents", {"metric": SUMMED_RETURN}))
+    if metric == RETURN:
+        teams = {run.config.task.name: run.config.task.roles for run in selected if len(run.config.task.teams) > 1}
+        findings += [
+            Finding("first_team", {"task": task, "teams": tuple(f"{RETURN}_{role.team}" for role in roles)})
+            for task, roles in teams.items()
+        ]
     return selected, findings
 
 

@@ -19,6 +19,7 @@ MESSAGES = {
     "unfinished": "{run} has only reached step {step:,} of {steps:,}: no run of its task is compared at a later step.",
     "untrained": "{run}: {reason}",
     "mean_over_agents": "Returns are means over the agents. --metric {metric} compares their sums.",
+    "first_team": "On {task}, returns are those of the first team. --metric takes that of each: {teams}.",
     "other_task": "The rows of {source} on {task} are left out: the runs are on {tasks}.",
     "other_steps": "{source} lacks {metric} of {label} on {task} at step {step:,} for some seeds: no run of {task} is compared there.",
     "differ": "The runs differ in {differences}.",
