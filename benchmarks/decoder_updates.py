@@ -24,7 +24,7 @@ from lare_rl.envs.particles.task import MAX_STEPS
 from lare_rl.evaluation.played_episodes import compute_proxy_rewards, unroll_policy
 from lare_rl.training import learner as learner_module
 from lare_rl.training.compiled import compile_functions
-from lare_rl.training.decoder_fits import fit_repeatedly
+from lare_rl.training.decoder_fits import update_repeatedly
 from lare_rl.training.learner import Learner
 from lare_rl.training.policy import get_actor
 from lare_rl.training.seed_axis import select_seed
@@ -83,7 +83,7 @@ def curve(name: str, updates: int) -> Iterator[tuple[int, tuple[float, float]]]:
     steps, factors = random_episodes(1, STORED, config), jnp.asarray(no_factors(STORED))
     learner = learner_module.store_with_factors(learner, steps, factors, config)
     test_steps = random_episodes(99, TEST_EPISODES, config)
-    fit = jax.jit(partial(fit_repeatedly, config=config))
+    fit = jax.jit(partial(update_repeatedly, config=config))
     for done in range(AT_A_TIME, updates + 1, AT_A_TIME):
         credit, _ = fit(learner, jax.random.key(done))
         learner = learner._replace(decoders=credit)

@@ -22,7 +22,7 @@ from lare_rl.credit.methods import METHODS
 from lare_rl.credit.rewards import proxy_rewards
 from lare_rl.data import replay
 from lare_rl.runs.directory import open_run
-from lare_rl.training.decoder_fits import fit_repeatedly
+from lare_rl.training.decoder_fits import update_repeatedly
 from lare_rl.training.decoder_inputs import decoder_inputs, step_batch
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import masked_correlation, mean_absolute_error
@@ -52,7 +52,7 @@ def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: in
     recent = jax.tree.map(lambda rows: rows[0], replay.read(learner.replay, index))
     first = jnp.isin(index.number[0], learner.replay.first)
     reward, valid = recent.columns["reward"][:, 0], jnp.ones(RECENT_STEPS, bool)
-    fit_some = jax.jit(fit_repeatedly, static_argnames="config")
+    fit_some = jax.jit(update_repeatedly, static_argnames="config")
     done = 0
     for n_fits in fits:
         while done < n_fits:

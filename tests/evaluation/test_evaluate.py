@@ -139,8 +139,8 @@ def test_random_play_is_bounded(monkeypatch):
     numbers = []
     play_random(TASK, 3, on_episode=numbers.append)
     assert numbers == [1, 2, 3]
-    monkeypatch.setattr(module, "MAX_RANDOM_PLAY_S", -1.0)
-    assert play_random(TASK) == [[]]
+    monkeypatch.setattr(module, "FEW_EPISODES_PLAY_S", -1.0)
+    assert play_random(TASK, limit_s=-1.0) == [[]]
 
 
 @pytest.mark.long

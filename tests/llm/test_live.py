@@ -299,7 +299,7 @@ def test_bytes_are_counted_without_usage(start_either, usage):
     model.reply(REQUEST, 0)
     assert model.budget.tokens_in == max_request_tokens(REQUEST)
     assert 50 < model.budget.tokens_out < 1000
-    assert "bytes count" in model.budget.summary()
+    assert "upper bound" in model.budget.summary()
 
 
 def test_token_budget(start):

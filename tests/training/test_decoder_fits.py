@@ -29,10 +29,10 @@ from lare_rl.training.decoder_fits import (
     PATIENCE,
     FirstFitStoppedError,
     config_of_first_fit,
-    fit_decoders,
-    fit_seeds,
     fit_until_converged,
     sample_credit,
+    update_all_seeds,
+    update_decoders,
 )
 
 
@@ -51,7 +51,7 @@ def test_update_in_chunks_is_that_of_the_batch(monkeypatch):
     results = []
     for rows in (72, 24):
         monkeypatch.setattr(decoder_fits, "CHUNK_ROWS", rows)
-        update = jax.jit(partial(fit_decoders, config=config))
+        update = jax.jit(partial(update_decoders, config=config))
         results.append(update(learner.decoders, learner.replay, sample, jax.random.key(1)))
     assert_close(*results, 1e-3, 1e-6)
 
@@ -59,7 +59,10 @@ def test_update_in_chunks_is_that_of_the_batch(monkeypatch):
 def test_seeds_are_fitted_at_once_or_one_after_the_other():
     config, keys = small_config("rd", fit_updates=2), jax.random.split(jax.random.key(0))
     seeds = stack_seeds(*(learner_with_episodes(config, seed) for seed in (0, 1)))
-    fits = (jax.jit(partial(fit_seeds, config=replace(config, vectorized=vectorized))) for vectorized in (False, True))
+    fits = (
+        jax.jit(partial(update_all_seeds, config=replace(config, vectorized=vectorized)))
+        for vectorized in (False, True)
+    )
     assert_close(*(fit(seeds, keys) for fit in fits), 1e-3, 1e-6)
 
 

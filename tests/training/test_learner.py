@@ -30,7 +30,7 @@ from helpers.small_configs import (
 from lare_rl.credit import closed_form
 from lare_rl.credit.rewards import proxy_rewards
 from lare_rl.nn.normalise import root_mean_square
-from lare_rl.training.decoder_fits import fit_decoders, sample_credit
+from lare_rl.training.decoder_fits import sample_credit, update_decoders
 from lare_rl.training.decoder_inputs import step_batch
 from lare_rl.training.learner import abandon_episodes
 from lare_rl.training.rewards import assess, rewards
@@ -48,7 +48,7 @@ def update_once(learner, config, key=0):
     """Return the decoders after one update, and its metrics."""
     samples = sample_credit(learner.replay, jax.random.key(key), 1, config)
     sample = jax.tree.map(lambda leaf: leaf[0], samples)
-    return jitted(fit_decoders, config)(learner.decoders, learner.replay, sample, jax.random.key(1))
+    return jitted(update_decoders, config)(learner.decoders, learner.replay, sample, jax.random.key(1))
 
 
 @pytest.mark.parametrize(

@@ -43,8 +43,8 @@ def whole_episodes(store: Store, spec: CreditSpec, episodes: Sequence[StoredEpis
     longest = int(lengths.max(initial=1))
     rows = padded_size(longest)
     if lengths.sum() > rows:
-        rows = padded_size(max(longest, min(MAX_CALL_STEPS // spec.agents, spec.n_assessed * longest)))
-    return pack_in_order(store, episodes, spec.n_assessed, rows)
+        rows = padded_size(max(longest, min(MAX_CALL_STEPS // spec.agents, spec.prediction_window * longest)))
+    return pack_in_order(store, episodes, spec.prediction_window, rows)
 
 
 def pack_in_order(store: Store, episodes: Sequence[StoredEpisode], n_episodes: int, rows: int) -> Iterator[CreditBatch]:

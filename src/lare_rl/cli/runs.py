@@ -23,7 +23,8 @@ def evaluate(
     """Evaluate the policy of a run by its true return, from initial states that no evaluation of the run has used.
 
     Prints the mean return of the policy and of random actions, with their standard deviations, and the difference with its standard
-    error. Random actions are played for as many episodes, but at least ten, or five where they are slow; in an environment in Python,
+    error. Random actions are played for as many episodes, but at least ten; fewer where they are slow. In an environment in Python they
+    start
     from the same initial states. A policy that samples its actions also plays the most likely ones.
 
     Args:

@@ -20,6 +20,7 @@ from lare_rl.envs.placement import load_env_spec
 from lare_rl.latent.function import LatentFunction
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import CreditScope, ScoredObservation, TaskSpec
+from lare_rl.util.rounding import round_up
 
 __all__ = ["CreditConfig", "TrainConfig", "make_train_config", "replay_rows"]
 
@@ -185,8 +186,8 @@ class TrainConfig(CreditConfig):
 
     @property
     def warmup(self) -> int:
-        """Environment steps with random actions before the first update."""
-        return getattr(self.hyperparameters, "warmup", 0)
+        """Environment steps with random actions before the first update: whole iterations."""
+        return round_up(getattr(self.hyperparameters, "warmup", 0), self.iteration_steps)
 
     @property
     def joint_fit(self) -> bool:

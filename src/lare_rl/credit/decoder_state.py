@@ -146,10 +146,10 @@ def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
         target_scale=jnp.zeros(()),
         is_average=jnp.asarray(spec.score_types == (ScoreType.AVERAGE,)),
         is_log_odds=jnp.asarray(False),
-        predictions=empty_predictions(1, spec.n_assessed),
+        predictions=empty_predictions(1, spec.prediction_window),
         closed_form=closed_form.init(basis, spec.score_types) if spec.has_closed_form else None,
         levels=empty_level_statistics(basis.n_levels) if has_level_means else None,
-        score_type_predictions=empty_predictions(n_types, spec.n_assessed) if n_types > 1 else None,
+        score_type_predictions=empty_predictions(n_types, spec.prediction_window) if n_types > 1 else None,
     )
 
 

@@ -71,7 +71,8 @@ def update_in_chunks(
     """Take one step of gradient descent on a batch that is divided into chunks, by the mean of their gradients.
 
     The chunks are along a leading axis. Each must have the same number of episodes, and all masks must be 1. The gradient then equals
-    that of the whole batch. The intermediate arrays are as small as for one chunk, so that they fit into the processor's cache.
+    that of the whole batch, in expectation where the loss draws random numbers. The intermediate arrays are as small as for one chunk,
+    so that they fit into the processor's cache.
     """
     n_chunks = len(chunks.length)
 

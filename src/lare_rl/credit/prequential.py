@@ -17,6 +17,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from lare_rl.util.statistics import CONSTANT
+
 __all__ = [
     "LITTLE_R2",
     "MIN_R2_EPISODES",
@@ -106,7 +108,7 @@ def r2(predictions: Predictions) -> Float[Array, " decoders"]:
     valid, count = predictions.valid, jnp.sum(predictions.valid)
     mean = jnp.sum(jnp.where(valid, predictions.returns, 0)) / jnp.maximum(count, 1)
     total = jnp.sum(jnp.where(valid, (predictions.returns - mean) ** 2, 0))
-    is_defined = (count >= MIN_R2_EPISODES) & (total > 1e-10 * count * mean**2)
+    is_defined = (count >= MIN_R2_EPISODES) & (total > CONSTANT * count * mean**2)
     return jnp.where(is_defined, 1 - squared_errors(predictions) / jnp.where(is_defined, total, 1), jnp.nan)
 
 

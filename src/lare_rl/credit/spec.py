@@ -48,7 +48,7 @@ class CreditSpec:
         return self.settings.exact in ("last", "spread") and "exact" in self.method.settings
 
     @property
-    def n_assessed(self) -> int:
+    def prediction_window(self) -> int:
         """The number of last returns (or payments) over which R^2 and gain are computed (`prequential.py`)."""
         return WINDOW if self.payments.only_at_end and self.settings.score != "binary" else SEGMENT_WINDOW
 

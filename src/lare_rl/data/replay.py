@@ -244,14 +244,14 @@ def required_capacity(steps: int, longest: int) -> int:
     return 2 * steps + longest
 
 
-HIDING_FIELDS = "current_episode", "running", "segments"
+FIELDS_CHANGED_BY_HIDING = "current_episode", "running", "segments"
 """The fields that `hide_newest` changes."""
 
 
 def hide_newest(replay: Replay, count: Int[Array, "*seeds envs"]) -> Replay:
     """Return the replay as if the newest payments of each environment, `count` of them, had not been made yet.
 
-    Nothing is removed: the same columns with the earlier `HIDING_FIELDS` show these episodes again.
+    Nothing is removed: the same columns with the earlier `FIELDS_CHANGED_BY_HIDING` show these episodes again.
     """
     before = segments_as_episodes(replay)
     return replace_payment_fields(

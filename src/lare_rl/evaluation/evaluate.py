@@ -19,7 +19,7 @@ from lare_rl.tasks.spec import TaskSpec
 from lare_rl.tasks.trust import trust_environment, untrusted_module
 from lare_rl.training.collect_device import DeviceCollector, make_jax_env
 from lare_rl.training.evaluation import Evaluation
-from lare_rl.training.saved_state import load_actor
+from lare_rl.training.saved_state import SavedActor, load_actor
 from lare_rl.training.streams import Stream, episode_seed
 from lare_rl.training.unroll_host import evaluate_policy_on_host
 from lare_rl.util.statistics import episode_error, grouped_standard_error, standard_error
@@ -28,6 +28,7 @@ __all__ = [
     "MAX_RANDOM_EPISODES",
     "MIN_RANDOM_EPISODES",
     "RANDOM_EPISODES",
+    "evaluate_actor",
     "evaluate_policy",
     "evaluate_run",
     "evaluation_seeds",
@@ -46,11 +47,11 @@ RANDOM_EPISODES = 10
 MAX_RANDOM_EPISODES = 50
 """The largest number of episodes with random actions that a report plays."""
 MIN_RANDOM_EPISODES = 5
-"""Fewer episodes have no useful standard deviation. Fewer are played only if they take longer than `MAX_RANDOM_PLAY_S`."""
-RANDOM_PLAY_LIMIT_S = 5.0
-"""Time after which no episode of random actions begins if there are `MIN_RANDOM_EPISODES`."""
-MAX_RANDOM_PLAY_S = 120.0
-"""Time after which no episode of random actions begins in any case."""
+"""Fewer episodes have no useful standard deviation."""
+RANDOM_PLAY_S = 5.0
+"""By default, the time after which no episode of random actions begins if there are `MIN_RANDOM_EPISODES`."""
+FEW_EPISODES_PLAY_S = 120.0
+"""The same if there are fewer."""
 
 
 def evaluate_run(
@@ -105,11 +106,20 @@ def evaluate_policy(
 
     On the host, `on_episode` is called with the number of episodes of each seed that have ended.
     """
-    episodes = check_count("episodes", episodes)
-    task = run.config.task
-    check_environment(task)
-    config, actor, _ = load_actor(run, best)
-    config = replace(config, deterministic=deterministic or None)
+    check_environment(run.config.task)
+    return evaluate_actor(run, load_actor(run, best), episodes, deterministic, on_episode)
+
+
+def evaluate_actor(
+    run: Run,
+    saved: SavedActor,
+    episodes: int,
+    deterministic: bool = False,
+    on_episode: EpisodeListener = lambda n_done: None,
+) -> Evaluation:
+    """Return what `evaluate_policy` returns, for a policy that was loaded before."""
+    task, episodes = run.config.task, check_count("episodes", episodes)
+    config, actor = replace(saved.config, deterministic=deterministic or None), saved.actor
     if load_env_spec(task).is_jax:
         return DeviceCollector(make_jax_env(task), config, run.seeds).evaluate(actor, episodes, number=1)
     task, first = task.evaluation_task, run.config.settings.evaluation_episodes
@@ -156,7 +166,7 @@ def measure_random_returns(
     task: TaskSpec, n_episodes: int = RANDOM_EPISODES, seeds: Sequence[int] = ()
 ) -> Float[np.ndarray, "teams episodes"]:
     """Return the returns of `play_random`, with a time limit in proportion to the number of episodes."""
-    limit_s = RANDOM_PLAY_LIMIT_S * n_episodes / RANDOM_EPISODES
+    limit_s = RANDOM_PLAY_S * n_episodes / RANDOM_EPISODES
     by_role = play_random(task, n_episodes, limit_s, seeds=seeds)
     return np.array([[episode.return_ for episode in episodes] for episodes in by_role])
 
@@ -169,14 +179,14 @@ def n_random_episodes(run_steps: int, longest_episode: int) -> int:
 def play_random(
     task: TaskSpec,
     n_episodes: int = RANDOM_EPISODES,
-    limit_s: float = RANDOM_PLAY_LIMIT_S,
+    limit_s: float = RANDOM_PLAY_S,
     on_episode: EpisodeListener = lambda n_done: None,
     seeds: Sequence[int] = (),
 ) -> list[list[Episode]]:
     """Play `n_episodes` episodes of random actions in the environment of evaluations, and return them for each role of the task.
 
-    There are fewer if they take longer than `limit_s` seconds (see `MIN_RANDOM_EPISODES`), and none if the environment does not run, or
-    its module is not trusted.
+    There are fewer if they take longer than `limit_s` seconds (the first `MIN_RANDOM_EPISODES` may take `FEW_EPISODES_PLAY_S`), and none
+    if the environment does not run, or its module is not trusted.
 
     Args:
         on_episode: called with the number of episodes after each.
@@ -189,7 +199,7 @@ def play_random(
     with suppress(LareError), closing(make_host_env(task)) as env:
         while len(episodes) < n_episodes:
             seconds = time.monotonic() - start
-            if seconds >= (limit_s if len(episodes) >= MIN_RANDOM_EPISODES else MAX_RANDOM_PLAY_S):
+            if seconds >= (limit_s if len(episodes) >= MIN_RANDOM_EPISODES else max(limit_s, FEW_EPISODES_PLAY_S)):
                 break
             number = len(episodes)
             seed = seeds[number % len(seeds)] if seeds else number

@@ -31,18 +31,19 @@ class Budget:
     tokens_in: int = 0
     tokens_out: int = 0
     seconds_used: float = 0.0
-    estimated: bool = False
-    """Whether bytes were counted as tokens, because a server did not report its tokens."""
+    is_upper_bound: bool = False
+    """Whether more tokens may be counted than were used, because a server did not report them."""
 
     def max_reply_tokens(self, messages: Sequence[Message], min_tokens: int) -> int:
-        """Return how many tokens the reply to a request may have. Each byte of the request counts as a token.
+        """Return how many tokens the reply to a request may have: what is left after the request, each byte of which counts as a token.
 
         Raises:
             BudgetExceededError: no request or time is left, or fewer than `min_tokens` tokens.
         """
         if self.requests_used >= self.requests:
-            raise BudgetExceededError(f"the budget of {self.requests} requests is spent")
-        self.add_pause(0.0)  # raises if the time is over
+            budget = format_for_reader(self.requests, "count request")
+            raise BudgetExceededError(f"the budget of {budget} is spent")
+        self._check_time()
         used = self.tokens_in + self.tokens_out
         remaining = self.tokens - used - max_request_tokens(messages)
         if remaining < min_tokens:
@@ -53,7 +54,10 @@ class Budget:
 
     @property
     def reply_timeout_s(self) -> float:
-        """The longest time for the next reply: the larger of 120 s and an eighth of `seconds`, but at most the time left."""
+        """The longest time for the first attempt at the next reply.
+
+        It is the larger of 120 s and an eighth of `seconds`, but at most the time left.
+        """
         return min(max(120.0, self.seconds / 8), self.seconds_left)
 
     @property
@@ -63,11 +67,14 @@ class Budget:
 
     def add_pause(self, seconds: float) -> None:
         """Count a pause before it begins. Raises `BudgetExceededError` if no time would be left after it."""
-        if seconds >= self.seconds_left:
-            pause = f", and a pause of {seconds:.0f} s comes next" if seconds else ""
+        self._check_time(seconds)
+        self.seconds_used += seconds
+
+    def _check_time(self, pause_s: float = 0.0) -> None:
+        if pause_s >= self.seconds_left:
+            pause = f", and a pause of {pause_s:.0f} s comes next" if pause_s else ""
             used = f"{self.seconds_used:.1f} of {self.seconds:g} s are used"
             raise BudgetExceededError(f"no time is left to wait for the model ({used}{pause})")
-        self.seconds_used += seconds
 
     @contextlib.contextmanager
     def count_request(self) -> Iterator[None]:
@@ -80,15 +87,15 @@ class Budget:
             self.seconds_used += time.monotonic() - start
 
     def timeout_text(self) -> str:
-        """Return the longest time for the next reply in words."""
+        """Return the longest time for the first attempt at the next reply, in words."""
         remaining = format_for_reader(self.seconds_left, "seconds")
-        return f"{self.reply_timeout_s:.0f} s at most ({remaining} are left for all)"
+        return f"{self.reply_timeout_s:.0f} s at most ({remaining} are left for the whole design)"
 
     def count_reply(self, usage: Any, messages: Sequence[Message], reply_bound: int) -> None:
         """Add the tokens of a request and its reply.
 
         Args:
-            usage: the numbers that the server reports, or anything else. Without them, bytes count as tokens.
+            usage: the numbers that the server reports, or anything else. Without them, upper bounds are counted.
             reply_bound: an upper bound on the tokens of the reply.
         """
         try:
@@ -97,19 +104,20 @@ class Budget:
                 raise ValueError("not a number of tokens")
         except (TypeError, KeyError, ValueError, OverflowError):
             tokens_in, tokens_out = max_request_tokens(messages), reply_bound
-            self.estimated = True
+            self.is_upper_bound = True
         self.tokens_in += tokens_in
         self.tokens_out += tokens_out
 
     def summary(self, prices: tuple[float, float] | None = None) -> str:
         """Return what was used, in one line. `prices` are those of a million tokens in, and of a million tokens out."""
-        estimated = " (bytes count as tokens where the server gave no numbers)" if self.estimated else ""
-        text = f"{self.requests_used} requests, {self.tokens_in:,} tokens in, {self.tokens_out:,} out{estimated}"
+        bound = " (an upper bound, because the server did not give all numbers)" if self.is_upper_bound else ""
+        requests = format_for_reader(self.requests_used, "count request")
+        text = f"{requests}, {self.tokens_in:,} tokens in, {self.tokens_out:,} out{bound}"
         if prices is not None:
             text += f", {(self.tokens_in * prices[0] + self.tokens_out * prices[1]) / 1e6:.4f} by the given prices"
         return text
 
 
 def max_request_tokens(messages: Sequence[Message]) -> int:
-    """Return an upper bound on the tokens of a request: the bytes of its messages, and 16 more for each."""
+    """Return a generous estimate of the tokens of a request: the bytes of its messages, plus 16 for each message."""
     return sum(len(message["content"].encode(errors="replace")) + 16 for message in messages)

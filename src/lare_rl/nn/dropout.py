@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from lare_rl.util.rounding import ceil_div
+
 __all__ = ["dropout"]
 
 
@@ -14,5 +16,5 @@ def dropout(x: Float[Array, "*shape"], key: PRNGKeyArray | None, rate: float) ->
     if rate != 0.5:
         return jnp.where(jax.random.bernoulli(key, 1 - rate, x.shape), x / (1 - rate), 0)
     # One random bit per entry: a random float per entry would take a fifth of the run time of STAS.
-    coins = jnp.unpackbits(jax.random.bits(key, (-(-x.size // 8),), jnp.uint8))
+    coins = jnp.unpackbits(jax.random.bits(key, (ceil_div(x.size, 8),), jnp.uint8))
     return 2 * x * coins[: x.size].reshape(x.shape)

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.algorithms.registry import ALGORITHMS
+from lare_rl.envs.load import check_environment
 from lare_rl.envs.placement import load_env_spec
 from lare_rl.envs.play import Episode, EpisodeListener
 from lare_rl.evaluation.evaluate import (
     RANDOM_EPISODES,
-    RANDOM_PLAY_LIMIT_S,
-    evaluate_policy,
+    RANDOM_PLAY_S,
+    evaluate_actor,
     evaluation_seeds,
     gain_over_random,
     mean_with_error,
@@ -35,22 +35,23 @@ def evaluation_lines(
 ) -> Iterator[str]:
     """Play episodes by the policy, by random actions and, for a policy that samples, by the most likely actions. Yield the results.
 
-    The arguments are those of `evaluate_policy`, but `make_listener` takes the number of episodes.
+    The arguments are those of `evaluate_run`. `make_listener` takes the number of episodes that will be played, and returns a function
+    that is called with the number that have ended.
     """
-    task, settings = run.config.task, run.config.settings
+    task = run.config.task
+    check_environment(task)
+    saved = load_actor(run, best)
     start = time.monotonic()
-    evaluation = evaluate_policy(run, episodes, best, deterministic, make_listener(episodes))
+    evaluation = evaluate_actor(run, saved, episodes, deterministic, make_listener(episodes))
     policy_s = time.monotonic() - start
-    env, algorithm = load_env_spec(task), ALGORITHMS[settings.algorithm]
-    samples = not (deterministic or algorithm.deterministic_evaluation(env.discrete, env.n_agents))
-    likeliest = evaluate_policy(run, episodes, best, True, make_listener(episodes)) if samples else None
-    best_steps = load_actor(run, best=True)[2].tolist() if best else None
-    seeds, n_random = evaluation_seeds(run, episodes), max(episodes, RANDOM_EPISODES)
-    if task.group is not None:  # every seed equally often, because groups may differ in their returns
-        n_random = round_up(RANDOM_EPISODES, len(seeds))
-    random_episodes = play_random(task, n_random, max(policy_s, RANDOM_PLAY_LIMIT_S), make_listener(n_random), seeds)
+    samples = not (deterministic or saved.config.deterministic_evaluation)
+    likeliest = evaluate_actor(run, saved, episodes, True, make_listener(episodes)) if samples else None
+    best_steps, seeds = saved.steps.tolist() if best else None, evaluation_seeds(run, episodes)
+    # With groups, every seed equally often, because groups may differ in their returns.
+    n_random = max(episodes, RANDOM_EPISODES) if task.group is None else round_up(RANDOM_EPISODES, len(seeds))
+    random_episodes = play_random(task, n_random, max(policy_s, RANDOM_PLAY_S), make_listener(n_random), seeds)
     yield from describe_evaluation(run, evaluation, random_episodes, best_steps)
-    if 0 < len(random_episodes[0]) < n_random:
+    if len(random_episodes[0]) < n_random:
         yield f"random actions played {len(random_episodes[0])} of {n_random} episodes: they are slow, or the environment failed"
     if likeliest is not None:
         yield "The policy samples its actions, as in training. The most likely ones (--deterministic), from the same states:"
@@ -61,7 +62,10 @@ def evaluation_lines(
 def describe_evaluation(
     run: Run, evaluation: Evaluation, random_episodes: Sequence[Sequence[Episode]], best_steps: Sequence[int] | None
 ) -> Iterator[str]:
-    """Yield the returns and measures of each seed, and of random actions. `best_steps` are the steps of the best policies."""
+    """Yield the returns and measures of each seed, and of random actions.
+
+    `best_steps` are the steps of training at which the best policies were saved. They are None for the last policies.
+    """
     task = run.config.task
     if task.evaluation_environment is not None:
         yield f"in {task.evaluation_environment} (training was in {task.environment}):"
@@ -77,7 +81,7 @@ def describe_evaluation(
         groups = Counter(np.asarray(evaluation.measures[group]).ravel().tolist())
         random_groups = Counter(episode.measures[group] for episode in random_episodes[0])
         if any(groups[name] * random_groups.total() != count * groups.total() for name, count in random_groups.items()):
-            yield f"random actions played other groups ({group}), or in other shares, which is a part of the difference"
+            yield f"random actions did not play the same groups ({group}) equally often; this is a part of the difference"
     for name, seed_values in evaluation.drop_group(task).measures.items():
         for seed, values in zip(run.seeds, seed_values, strict=True):
             yield f"seed {seed}: {name} {format_mean_std(values)}"
@@ -88,16 +92,16 @@ def describe_evaluation(
 
 def _compare_actions(run: Run, sampled: Evaluation, likeliest: Evaluation) -> Iterator[str]:
     """Say which actions are better, if that is clear. Both evaluations play from the same initial states."""
-    for team_index, role in enumerate(run.config.task.roles):
+    for team_index, prefix in enumerate(_team_prefixes(run.config.task)):
         difference = mean_with_error((likeliest.returns - sampled.returns)[:, :, team_index])
         if difference is not None and abs(difference[0]) > CLEAR_ERRORS * difference[1]:
             better = "better: use `--deterministic` here, and `load_policy(..., deterministic=True)` in Python"
             verdict = better if difference[0] > 0 else "worse: let the policy sample"
-            yield f"{role.name}: the most likely actions are {verdict} ({format_plus_minus(*difference)})"
+            yield f"{prefix}the most likely actions are {verdict} ({format_plus_minus(*difference)}; ± is the standard error)"
 
 
 def _describe_returns(run: Run, evaluation: Evaluation, best_steps: Sequence[int] | None) -> Iterator[str]:
-    """Yield the returns of each seed. `best_steps` are the steps of the best policies."""
+    """Yield the returns of each seed. `best_steps` is as in `describe_evaluation`."""
     has_many_agents = load_env_spec(run.config.task).n_agents > 1
     for team_index, prefix in enumerate(_team_prefixes(run.config.task)):
         for seed_index, seed in enumerate(run.seeds):

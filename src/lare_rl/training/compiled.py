@@ -23,7 +23,7 @@ from lare_rl.phi.graph import Graph
 from lare_rl.training import collect_device, off_policy, on_policy, sequences
 from lare_rl.training.collect_device import VecEnvState
 from lare_rl.training.compile_cache import cache_by_value
-from lare_rl.training.decoder_fits import fit_seeds
+from lare_rl.training.decoder_fits import update_all_seeds
 from lare_rl.training.episodes import learn_returns
 from lare_rl.training.learner import Learner, init_learner, store
 from lare_rl.training.policy import get_actor, init_algorithm
@@ -102,7 +102,7 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
         store=compiled_store,
         learn_returns=learn_in_float64,
         compile_learning=compile_learning,
-        fit=jit(partial(fit_seeds, config=config), donate=(0,)),
+        fit=jit(partial(update_all_seeds, config=config), donate=(0,)),
         train_step=jit(_train_step_function(config), shared=(3,), donate=(0,)),
         assess=jit(jax.vmap(partial(assess, config=config))),
     )
@@ -237,7 +237,7 @@ def _loop_shape(env: JaxEnv, config: TrainConfig, n_seeds: int) -> LoopState:
         _, steps = collect_device.collect(env, envs, actor, keys, start, config)
         metrics = _train_step_function(config)(learner, steps, keys, start)[1]
         if config.fits_separately:
-            metrics |= fit_seeds(learner, keys, config)[1]
+            metrics |= update_all_seeds(learner, keys, config)[1]
         is_measured = {name: jnp.zeros(n_seeds, bool) for name in metrics}
         return LoopState(learner, envs, metrics, is_measured, steps, jnp.ones(n_seeds, bool))
 
@@ -260,7 +260,7 @@ def _iterate(
             return learn_returns(learner, config)
 
     def fit(before: LoopState) -> LoopState:
-        learner, metrics = fit_seeds(before.learner, stream_keys(seeds, Stream.FIT, env_steps), config)
+        learner, metrics = update_all_seeds(before.learner, stream_keys(seeds, Stream.FIT, env_steps), config)
         return _record(before, learner, metrics)
 
     def fit_and_update(before: LoopState) -> LoopState:

@@ -1,8 +1,8 @@
 """Gradient updates of the decoders: which steps an update reads, the update, and the first fit for many agents.
 
-The first fit lasts until the error on held-out episodes stops falling. With `first_fit = "published"`, a decoder is fitted in 50 updates
-to the first episodes and, after every tenth iteration, in 50 more. With 15 agents that is too few: the policy has settled before the
-decoder is accurate (benchmarks/results/agents.md).
+The first fit lasts until the error on held-out episodes stops falling. With `first_fit = "published"` there is none: from the first
+iteration on, the decoders of IPPO get `fit_updates` updates (50) every `fit_every` iterations (10). With 15 agents that is too few: the
+policy has settled before the decoder is accurate (benchmarks/results/agents.md).
 """
 
 import dataclasses
@@ -31,16 +31,17 @@ from lare_rl.training.episodes import Decoders, fold_episodes
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import team_metrics
 from lare_rl.training.seed_axis import jit_over_seeds
+from lare_rl.util.rounding import ceil_div
 
 __all__ = [
     "FirstFitStoppedError",
     "config_of_first_fit",
-    "fit_decoders",
-    "fit_repeatedly",
-    "fit_seeds",
     "fit_until_converged",
     "has_enough_episodes",
     "sample_credit",
+    "update_all_seeds",
+    "update_decoders",
+    "update_repeatedly",
 ]
 
 CHUNK_ROWS = 2400
@@ -59,7 +60,7 @@ few episodes yet, and large updates would read each of them several times. The d
 
 
 class FirstFitStoppedError(Exception):
-    """The user asked the run to stop during the first fit. Its iteration is lost."""
+    """The user asked the run to stop during the first fit. The iteration in which it ran is lost."""
 
 
 def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: CreditConfig) -> CreditSample:
@@ -72,10 +73,11 @@ def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: Credi
         case "padded":
             return sample_padded(buffer, key, updates, plan.episodes, plan.rows)
         case "packed":
+            # Here every step may be an episode of its own, so `plan.episodes`, which is for `CreditAssigner`, may be too small.
             return sample_packed(buffer, key, updates, config.credit.steps, plan.rows)
 
 
-def fit_decoders(
+def update_decoders(
     decoders: Decoders, buffer: Replay, sample: CreditSample, key: PRNGKeyArray, config: CreditConfig
 ) -> tuple[Decoders, Metrics]:
     """Update every team's decoder once."""
@@ -92,11 +94,12 @@ def _update_decoder(
     decoder: DecoderState, batch: CreditBatch, key: PRNGKeyArray, config: CreditConfig, spec: CreditSpec
 ) -> tuple[DecoderState, Metrics]:
     """Take one gradient step. The gradient of a large batch of equally long episodes is computed in chunks."""
+    # Rows of agents count one by one.
     n_rows, n_episodes = batch.inputs[..., 0].size, len(batch.length)
     n_chunks = 1
     if not config.vectorized and config.has_fixed_segments and n_rows > CHUNK_ROWS:
         chunk_episodes = max(1, CHUNK_ROWS * n_episodes // n_rows)
-        chunk_counts = range(-(-n_episodes // chunk_episodes), n_episodes + 1)
+        chunk_counts = range(ceil_div(n_episodes, chunk_episodes), n_episodes + 1)
         n_chunks = next(n for n in chunk_counts if n_episodes % n == 0)
     if n_chunks == 1:
         return descent.update(decoder, batch, key, spec)
@@ -106,22 +109,22 @@ def _update_decoder(
     return descent.update_in_chunks(decoder, chunks, key, spec)
 
 
-def fit_seeds(learner: Learner, keys: Key[Array, " seeds"], config: CreditConfig) -> tuple[Learner, Metrics]:
+def update_all_seeds(learner: Learner, keys: Key[Array, " seeds"], config: CreditConfig) -> tuple[Learner, Metrics]:
     """Update the decoders of every seed `fit_updates` times. Return the mean of each metric."""
     # On a CPU, one seed after the other: a batch of one seed fills the caches already.
     decoders, metrics = map_leading_axis(
-        lambda pair: fit_repeatedly(*pair, config), (learner, keys), vectorized=config.vectorized
+        lambda pair: update_repeatedly(*pair, config), (learner, keys), vectorized=config.vectorized
     )
     return learner._replace(decoders=decoders), metrics
 
 
-def fit_repeatedly(learner: Learner, key: PRNGKeyArray, config: CreditConfig) -> tuple[Decoders, Metrics]:
+def update_repeatedly(learner: Learner, key: PRNGKeyArray, config: CreditConfig) -> tuple[Decoders, Metrics]:
     """Update the decoders `fit_updates` times. Return them, and the mean of each metric."""
     sample_key, key = jax.random.split(key)
     samples = sample_credit(learner.replay, sample_key, config.fit_updates, config)
 
     def body(decoders: Decoders, update: tuple[CreditSample, PRNGKeyArray]):
-        return fit_decoders(decoders, learner.replay, *update, config)
+        return update_decoders(decoders, learner.replay, *update, config)
 
     decoders, metrics = jax.lax.scan(body, learner.decoders, (samples, jax.random.split(key, config.fit_updates)))
     return decoders, jax.tree.map(jnp.mean, metrics)
@@ -141,7 +144,7 @@ def config_of_first_fit(config: TrainConfig) -> TrainConfig:
 
 def fit_until_converged(
     learner: Learner,
-    fit: Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, Metrics]],
+    fit_round: Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, Metrics]],
     keys: Key[Array, " seeds"],
     config: TrainConfig,
     stop_requested: Callable[[], bool],
@@ -150,16 +153,18 @@ def fit_until_converged(
 
     Args:
         learner: the learner of all seeds, with enough episodes.
-        fit: one round of updates. It consumes its learner.
+        fit_round: one round of updates. It reuses the memory of its learner.
         keys: random keys; the keys of each round are derived from them.
         stop_requested: whether the user has asked the run to stop.
 
     Raises:
         FirstFitStoppedError: the user has asked the run to stop.
     """
-    # The learner is copied, here and below, because each round consumes it.
-    originals = {name: jax.tree.map(jnp.copy, getattr(learner.replay, name)) for name in replay.HIDING_FIELDS}
-    n_held_out = jax.vmap(partial(_count_held_out, window=config.credit_specs[0].n_assessed))(
+    # What is needed after a round is copied before it, here and below.
+    originals = {
+        name: jax.tree.map(jnp.copy, getattr(learner.replay, name)) for name in replay.FIELDS_CHANGED_BY_HIDING
+    }
+    n_held_out = jax.vmap(partial(_count_held_out, window=config.credit_specs[0].prediction_window))(
         replay.segments_as_episodes(learner.replay)
     )
     compute_error = jit_over_seeds(jax.vmap(partial(_held_out_error, config=config)), config.n_devices)
@@ -170,14 +175,15 @@ def fit_until_converged(
         if stop_requested():
             raise FirstFitStoppedError
         round_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
-        learner, new_metrics = fit(learner._replace(replay=replay.hide_newest(learner.replay, n_held_out)), round_keys)
+        hidden = replay.hide_newest(learner.replay, n_held_out)
+        learner, new_metrics = fit_round(learner._replace(replay=hidden), round_keys)
         full = learner.replay._replace(**jax.tree.map(jnp.copy, originals))
         learner = learner._replace(replay=full)
         error = np.asarray(compute_error(learner.decoders, full, n_held_out))
         # How long a seed is fitted does not depend on the other seeds.
         is_better = (error < best_error) & (rounds_without_gain < PATIENCE)
         best_decoders = select(jnp.asarray(is_better), learner.decoders, best_decoders)
-        metrics = select(jnp.asarray(is_better), new_metrics, metrics or new_metrics)
+        metrics = select(jnp.asarray(is_better), new_metrics, metrics) if number else new_metrics
         best_error = np.where(is_better, error, best_error)
         rounds_without_gain = np.where(is_better, 0, rounds_without_gain + 1)
         if (rounds_without_gain >= PATIENCE).all():
@@ -201,8 +207,8 @@ def _held_out_error(
     decoders: Decoders, buffer: Replay, n_held_out: Int[Array, " envs"], config: CreditConfig
 ) -> Float[Array, ""]:
     """Return the sum over the teams of the squared error of held-out returns, divided by the mean square of the team's returns."""
-    spec = config.credit_specs[0]
-    decoders = tuple(decoder._replace(predictions=empty_predictions(1, spec.n_assessed)) for decoder in decoders)
+    spec = config.credit_specs[0]  # predictions need only what all teams have in common
+    decoders = tuple(decoder._replace(predictions=empty_predictions(1, spec.prediction_window)) for decoder in decoders)
     since = replay.segments_as_episodes(buffer).current_episode - n_held_out
     decoders = fold_episodes(
         decoders, buffer, since, lambda decoder, episodes, _: learning.predict(decoder, episodes, spec), config

@@ -101,7 +101,7 @@ def _learn_if_due(
         inputs = closed, statistics, buffer, is_stale
         closed = jax.lax.cond(jnp.any(is_stale), rebuild, lambda unchanged, *_: unchanged, *inputs)
     return tuple(
-        _fit_seeds(
+        _fit_closed_forms(
             decoder._replace(closed_form=form),
             has_enough_new & jax.vmap(closed_form.is_due)(form),
             spec,
@@ -132,8 +132,8 @@ def fold_episodes(
         expected: about how many episodes there are; None if they may be many.
     """
     buffer = replay.segments_as_episodes(buffer)
-    # `learning.predict` stores at most `n_assessed` predictions.
-    longest, n_episodes = config.longest_segment, config.credit_specs[0].n_assessed
+    # `learning.predict` stores at most `prediction_window` predictions.
+    longest, n_episodes = config.longest_segment, config.credit_specs[0].prediction_window
     expected = n_episodes if expected is None else max(1, expected)
     rows = max(1, min(expected, n_episodes, MAX_ROWS // (config.n_proxy_rewards * longest))) * longest
     total = jnp.sum(count_episodes_since(buffer, since))
@@ -186,7 +186,7 @@ def _rebuild_sums(
     return select(is_stale, rebuilt, closed)
 
 
-def _fit_seeds(
+def _fit_closed_forms(
     decoder: DecoderState, is_due: Bool[Array, " seeds"], spec: CreditSpec, vectorized: bool
 ) -> DecoderState:
     """Make the closed-form fits of a team's decoder for the seeds that are due."""

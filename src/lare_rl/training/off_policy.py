@@ -17,11 +17,10 @@ from lare_rl.data import replay
 from lare_rl.data.replay import StoredSteps
 from lare_rl.data.sampling import sample_transitions
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.training.decoder_fits import fit_decoders, sample_credit
+from lare_rl.training.decoder_fits import sample_credit, update_decoders
 from lare_rl.training.episodes import Decoders
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import rewards
-from lare_rl.util.rounding import round_up
 
 __all__ = ["train_step"]
 
@@ -45,7 +44,7 @@ def train_step(
         fit_key, key = jax.random.split(key)
         metrics = {}
         if credit_sample is not None:
-            decoders, metrics = fit_decoders(decoders, buffer, credit_sample, fit_key, config)
+            decoders, metrics = update_decoders(decoders, buffer, credit_sample, fit_key, config)
         stored = replay.read(buffer, index)
         batch = _transitions(stored, rewards(stored, decoders, config))
         state, algorithm_metrics = algorithm.update(state, batch, key, update_index, settings)
@@ -54,7 +53,7 @@ def train_step(
     # The steps of all updates are sampled at once. Their rows are read when the update runs.
     batch_key, credit_key = jax.random.split(sample_key)
     inputs = (
-        env_steps - round_up(settings.warmup, config.iteration_steps) + jnp.arange(config.iteration_steps),
+        env_steps - config.warmup + jnp.arange(config.iteration_steps),
         sample_transitions(buffer, batch_key, (config.iteration_steps, settings.batch_size)),
         sample_credit(buffer, credit_key, config.iteration_steps, config) if config.joint_fit else None,
         jax.random.split(update_key, config.iteration_steps),

@@ -34,7 +34,7 @@ from lare_rl.latent.function import LatentFunction
 from lare_rl.phi.graph import Graph
 from lare_rl.tasks.spec import ScoredObservation
 from lare_rl.training import episodes
-from lare_rl.training.decoder_fits import fit_repeatedly
+from lare_rl.training.decoder_fits import update_repeatedly
 from lare_rl.training.decoder_inputs import compute_factors
 from lare_rl.training.learner import Learner, init_learner, replay_columns, store_with_factors
 from lare_rl.training.rewards import rewards
@@ -213,7 +213,7 @@ def _make_functions(config: CreditConfig, phi: tuple[Graph, ...]) -> PureCredit:
         learner = learner._replace(decoders=decoders, n_learned=n_learned)
         if config.method.uses_gradient:
             has_episode = jnp.any(segments_as_episodes(learner.replay).current_episode > 0)
-            fitted = jax.lax.cond(has_episode, lambda: fit_repeatedly(learner, key, config)[0], lambda: decoders)
+            fitted = jax.lax.cond(has_episode, lambda: update_repeatedly(learner, key, config)[0], lambda: decoders)
             learner = learner._replace(decoders=fitted)
         return state._replace(learner=learner)
 

@@ -17,7 +17,7 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.policy import actor_shape, get_actor
 from lare_rl.util.provenance import code_version
 
-__all__ = ["SavedState", "load_actor", "load_learner", "make_run_config"]
+__all__ = ["SavedActor", "SavedState", "load_actor", "load_learner", "make_run_config"]
 
 
 class SavedState(NamedTuple):
@@ -34,6 +34,15 @@ class SavedState(NamedTuple):
     def actor(self) -> Any:
         """The actor of all seeds."""
         return get_actor(self.learner.algorithm, self.metadata["step"], self.config)
+
+
+class SavedActor(NamedTuple):
+    """The actor of all seeds, with the configuration of the run."""
+
+    config: TrainConfig
+    actor: Any
+    steps: Int[np.ndarray, " seeds"]
+    """The step of training at which each seed's actor was saved."""
 
 
 def make_run_config(run: Run, n_devices: int = 1) -> TrainConfig:
@@ -60,18 +69,11 @@ def load_learner(run: Run, n_devices: int = 1) -> SavedState:
         raise LareError(f"{error}; the run is of LaRe {run.config.lare}, and this is LaRe {code_version()}") from error
 
 
-def load_actor(run: Run, best: bool = False) -> tuple[TrainConfig, Any, Int[np.ndarray, " seeds"]]:
-    """Load the actor of the last checkpoint or, for each seed, of its best evaluation.
-
-    Returns:
-        The configuration, the actor, and the step at which each seed's actor was saved.
-
-    Raises:
-        LareError: no actor has been saved.
-    """
+def load_actor(run: Run, best: bool = False) -> SavedActor:
+    """Load the actor of the last checkpoint or, for each seed, of its best evaluation. Raises `LareError` if none has been saved."""
     if best:
         config = make_run_config(run)
         best_policy = load_best(run.checkpoint, actor_shape(config, len(run.seeds)), len(run.seeds))
-        return config, best_policy.actor, best_policy.step
+        return SavedActor(config, best_policy.actor, best_policy.step)
     state = load_learner(run)
-    return state.config, state.actor, np.full(len(run.seeds), state.metadata["step"])
+    return SavedActor(state.config, state.actor, np.full(len(run.seeds), state.metadata["step"]))

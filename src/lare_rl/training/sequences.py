@@ -24,11 +24,12 @@ from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, team_mean, with_available_action
 from lare_rl.nn.masks import select, step_mask
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, standardise_unless_empty, update_mean_std
-from lare_rl.training.decoder_fits import fit_decoders, sample_credit
+from lare_rl.training.decoder_fits import sample_credit, update_decoders
 from lare_rl.training.decoder_inputs import alive_agents
 from lare_rl.training.episodes import Decoders
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import rewards
+from lare_rl.util.rounding import ceil_div
 
 __all__ = ["Actor", "SequenceState", "get_actor", "init", "train_step"]
 
@@ -137,7 +138,7 @@ def _batch_lengths(config: TrainConfig) -> list[int]:
     longest = config.env.max_steps
     if config.env.fixed_length or longest < MIN_STEPS_TO_SHORTEN:
         return [longest]
-    return sorted({-(-longest // 4), -(-longest // 2), longest})  # rounded up
+    return sorted({ceil_div(longest, 4), ceil_div(longest, 2), longest})
 
 
 def _observe_states(statistics: RunningMeanStd, steps: Trajectory, config: TrainConfig) -> RunningMeanStd:
@@ -161,7 +162,7 @@ def _update_seed(
     if config.joint_fit:
         samples = sample_credit(learner.replay, sample_key, 1, config)
         sample = jax.tree.map(lambda leaf: leaf[0], samples)  # without the axis of updates
-        decoders, metrics = fit_decoders(learner.decoders, learner.replay, sample, fit_key, config)
+        decoders, metrics = update_decoders(learner.decoders, learner.replay, sample, fit_key, config)
     state, settings = learner.algorithm, _settings(config)
     batch = _sequences(learner.replay, episodes, n_steps, decoders, state.mixer_statistics, config)
     n_episodes = update_number * settings.update_every

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from lare_rl.turns.features import TurnTable
 from lare_rl.turns.regression import PrefixFit, fit_linear
+from lare_rl.util.rounding import ceil_div
 
 __all__ = ["advantages", "changes", "fit_prefixes", "held_out_values", "posterior_stds", "values"]
 
@@ -97,7 +98,7 @@ def held_out_values(
     held_out = np.empty_like(prediction)
     for size in np.unique(table.length).tolist():
         same_length = np.flatnonzero(table.length == size)
-        for rollouts in np.array_split(same_length, -(-len(same_length) * size**2 // MAX_NUMBERS)):
+        for rollouts in np.array_split(same_length, ceil_div(len(same_length) * size**2, MAX_NUMBERS)):
             index = table.first[rollouts][:, None] + np.arange(size)
             block = rows[index]
             covariance = block @ block.swapaxes(1, 2) + 1 / fit.group_precision[table.group[rollouts]][:, None, None]
