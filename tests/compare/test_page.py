@@ -50,10 +50,13 @@ def test_command(make_run, command, tmp_path):
     assert "three quarters of 50 steps" in out
     assert "three quarters of 50 steps" in (tmp_path / "late.html").read_text()
     config = runs[0].directory / "config.json"
-    for out, content in ((".", "not the name of a file"), (config, "configuration of a run")):
+    for out, content in ((".", "not the name of a file"), (config, "is no page")):
         status, _, error = command("compare", *paths, "--out", out)
         assert (status, error.count("\n"), content in error) == (2, 1, True)
     assert config.read_text().startswith("{")
+    table = tmp_path / "table.csv"
+    table.write_text(text := "method,task,seed,step,evaluation/return\nother,Chase,0,100,1\n")
+    assert (command("compare", table, "--out", table)[0], table.read_text()) == (2, text)
 
 
 def test_outputs_of_a_sweep_among_its_runs(make_run, command, tmp_path):
@@ -66,6 +69,10 @@ def test_outputs_of_a_sweep_among_its_runs(make_run, command, tmp_path):
     results, _ = collect_results([tmp_path / "runs", *outputs])
     assert results == read(runs)
     assert len(collect_results([tmp_path / "results.csv"])[0]) == 4
+    assert len(collect_results([tmp_path / "results.csv", tmp_path / "compare.html"])[0]) == 4
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "results.csv").rename(tmp_path / "elsewhere" / "results.csv")
+    assert len(collect_results([runs[0].directory, tmp_path / "elsewhere" / "results.csv"])[0]) > 2
 
 
 def test_comparison_table(make_run):
@@ -82,7 +89,7 @@ def test_comparison_table(make_run):
 
 
 def test_smallest_p(make_run):
-    """Two seeds above two outputs, or below them: two of the six ways to deal four numbers."""
+    """Two seeds above two others, or below them: two of the six ways to deal four numbers."""
     runs = [make_run("a", [1.0, 2.0]), make_run("b", [3.0, 4.0], method="rd"), make_run("c", [0.0, 0.5], method="rrdu")]
     comparison = compare(read(runs))
     _, better, worse = comparison.rows

@@ -187,11 +187,12 @@ def test_a_worker_makes_the_environment_of_this_process_or_none(monkeypatch):
     """A script may register a class of its own under the name of another environment."""
     task = toy_spec(environment="CartPole-v1", observation_size=4, action_size=2)
     entry = gymnasium.registry["CartPole-v1"]
-    monkeypatch.setitem(gymnasium.registry, "CartPole-v1", replace(entry, entry_point=Chase))
-    pickled = pickle.dumps(picklable_maker(task))
-    monkeypatch.setitem(gymnasium.registry, "CartPole-v1", entry)
-    with pytest.raises(LareError, match=r"CartPole-v1: a worker process makes another .*MODULE:NAME"):
-        pickle.loads(pickled)()
+    for changes in ({"entry_point": Chase}, {"kwargs": {"sutton_barto_reward": True}}):
+        monkeypatch.setitem(gymnasium.registry, "CartPole-v1", replace(entry, **changes))
+        pickled = pickle.dumps(picklable_maker(task))
+        monkeypatch.setitem(gymnasium.registry, "CartPole-v1", entry)
+        with pytest.raises(LareError, match=r"CartPole-v1: a worker process makes another .*MODULE:NAME"):
+            pickle.loads(pickled)()
     assert pickle.loads(pickle.dumps(picklable_maker(task)))().spec.max_steps == 500
 
 

@@ -175,8 +175,8 @@ def test_evaluation_environment_with_other_agents(name, content):
 
 
 def test_environment_that_is_registered_again():
-    task = toy_spec(environment="toys/AgainChase-v0")
-    for limit in (20, 30):
+    tasks = toy_spec(environment="toys/AgainChase-v0"), toy_spec(environment="toys/AgainChase")
+    for task, limit in ((task, limit) for limit in (20, 30) for task in tasks):
         with warnings.catch_warnings(action="ignore"):  # that it is registered again
             gymnasium.register("toys/AgainChase-v0", entry_point=Chase, max_episode_steps=limit)
         check_environment(task)

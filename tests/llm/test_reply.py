@@ -74,6 +74,11 @@ def test_fence_in_a_docstring():
         assert parse_reply(json.dumps(GOOD | {"Functions": code})).functions == code
 
 
+def test_words_around_a_fence():
+    text = f"This is it:\n```python\n{CODE}\n```\nThe def above returns one factor."
+    assert parse_reply(json.dumps(GOOD | {"Functions": text})).functions.strip() == CODE
+
+
 def test_functions_of_several_fences():
     helper = "def double(x):\n    return 2 * x"
     text = f"A draft:\n```\n{CODE}\n```\nBetter:\n```\n{helper}\n```\n```\n{CODE.replace('[action]', '[double(action)]')}\n```"

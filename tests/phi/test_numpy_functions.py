@@ -68,7 +68,9 @@ EXPRESSIONS = {
         (lambda v: [np.nan_to_num(v, copy=False, nan=7.0), v][1])(n * 1.0) | np.reciprocal(i + 2) | np.reciprocal(-1 - i)
         np.fabs(b) + np.fabs(b) | np.fabs(i) / 2 | np.logaddexp.reduce(np.where(b, x, -np.inf), axis=1) | np.log1p(np.abs(x) * 1e-6) * 1e6
         np.expm1(x * 1e-6) * 1e6 | np.hypot(x * 1e18, 1e18) / 1e18 | np.round(x, 1) // 0.1 | np.round(x, 1) % 0.1 < 0.05
-        np.signbit(x * 0) | np.copysign(1.0, x * 0) | np.arctan2(x * 0, -np.abs(x)) | np.arctan2(0.0, x * 0) | np.arctan2(x * 0, x * 0)
+        np.signbit(x * 0) | np.copysign(1.0, x * 0) | np.arctan2(x * 0, -np.abs(x)) | np.log1p(np.abs(x) * 1e38)
+        np.arctan2(x / 0, a[:, :1] / 0)
+        -1 // (np.abs(x) / 0 + 1) | np.arctan2(0.0, x * 0) | np.arctan2(x * 0, x * 0)
         np.piecewise(i, [i < 2], [0.5, 1.7]) | b ** 2 + b ** 2 | np.square(b) + np.square(b)
         np.isnan(b) | np.isinf(i) | np.isclose(i, i[:, ::-1])
     """,

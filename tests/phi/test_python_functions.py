@@ -51,6 +51,11 @@ EXPRESSIONS = """
     {1, 2} < {1, 2, 3} | {1} <= {2} | {1, 2} == {2, 1} | 'a b'.rpartition(' ')[2] == 'b' | len('a b'.splitlines())
     isinstance('a', collections.abc.Sequence) | isinstance({}, collections.abc.Iterable) | isinstance(len, collections.abc.Callable)
     isinstance(range(3), collections.abc.Sequence) | hasattr([1], '__len__') | hasattr({}, '__iter__') | hasattr(5, '__len__')
+    hasattr(np.float64(1), '__len__') | hasattr(lambda: 0, '__call__') | hasattr(len, '__call__') | callable(np.ndarray)
+    isinstance({1}, (set, frozenset)) | isinstance(frozenset([1]), set) | isinstance({'a': 1}.keys(), (list, frozenset))
+    {} == set() | {1: None} == {1} | [{}] == [set()] | frozenset([1, 2]) == {2, 1} | len(frozenset([1]) - {1}) | len(str(frozenset([1])))
+    len(f"{['é']!a}") | len(dict({'ab': 1}.keys())) | iter([1]) == iter([1]) | sum({3, 10, 17, 24, 31}) | max({3, 10, 17, 24, 31})
+    sorted({3, 10, 17, 24, 31})[1] | len({3, 10, 17, 24, 31} - {3})
     bool(x for x in []) | 1 if filter(None, [0]) else 0 | callable(len) | callable(5)
     collections.OrderedDict([('a', 2)])['a'] | float('%.3f' % 1.23456) | float('{:.1f}'.format(2.25)) | float(f'{1.5:.2f}')
 """
@@ -62,10 +67,14 @@ CASES = [[e.strip() for e in line.split("|")] for line in EXPRESSIONS.strip().sp
 @pytest.mark.parametrize("expressions", CASES, ids=lambda expressions: expressions[0])
 def test_number_is_that_of_python(expressions):
     factors = ", ".join(f"observation[:, :1] * 0 + ({expression})" for expression in expressions)
-    graph = read("".join(f"import {name}\n" for name in MODULES) + phi_source(f"return [{factors}]"), 17, 6)
+    graph = read(
+        "import numpy as np\n" + "".join(f"import {name}\n" for name in MODULES) + phi_source(f"return [{factors}]"),
+        17,
+        6,
+    )
     inputs = {"observation": np.ones((2, 17)), "action": np.ones((2, 6))}
     results = evaluate(graph, inputs, dtype=np.float64)["factors"]
-    expected = [float(eval(expression, dict(MODULES))) for expression in expressions]
+    expected = [float(eval(expression, MODULES | {"np": np})) for expression in expressions]
     np.testing.assert_allclose(results, [expected] * 2, rtol=1e-15)
 
 
@@ -89,6 +98,14 @@ def test_number_is_that_of_python(expressions):
         "class D(C, B):\n    pass\nn = D().f()",
         "class A:\n    def f(self):\n        return 1\nclass B(A):\n    def f(self):\n        return 10 + super().f()\n"
         "class C(A):\n    def f(self):\n        return 100 + super().f()\nclass D(B, C):\n    pass\nn = D().f()",
+        "class A:\n    def __init__(self):\n        super().__init__()\n        self.n = 3\nn = A().n",
+        "class A:\n    @classmethod\n    def f(cls):\n        return 1\nclass B(A):\n    @classmethod\n    def f(cls):\n"
+        "        return 10 + super().f()\nn = B.f()",
+        "it = iter([1, 2])\nn = (it is iter(it)) + next(it)",
+        "try:\n    n = len(iter([1]))\nexcept TypeError:\n    n = 7",
+        "try:\n    n = iter([1])[0]\nexcept TypeError:\n    n = 7",
+        "try:\n    n = f'{[1]:.1f}'\nexcept TypeError:\n    n = 7",
+        "try:\n    n = {1} < [1]\nexcept TypeError:\n    n = 7",
         "import numpy as np\nn = len({f'{v:.1f}': v for v in np.array([0.5, 1.5])}) + len(f'{np.mean([1, 2]):.1f}')",
         "import numpy as np\nn = len([0] * round(np.float64(1.6))) + [5, 6, 7][round(np.float64(1.2))] + len(str(round(np.float64(2.5))))",
         "from dataclasses import dataclass, field\n@dataclass\nclass A:\n    x: list = field(default_factory=list)\n"
@@ -107,12 +124,13 @@ def test_statements_have_their_effect_in_python(statements):
     "statement",
     [
         "n = ord('a')", "n = pow(2, 5, 7)", "n = np.sum([])", "n = complex(1, 2).real", "n = int('ff', 16)", "n = hash(3)",
-        "l[0:2] = [5]", "n = len(f'{np.ones(2):.1f}')", "n = getattr([], '__len__', 3)", "n = isinstance(frozenset(), frozenset)",
+        "l[0:2] = [5]", "n = len(f'{np.ones(2):.1f}')", "n = getattr([], '__len__', 3)",
+        "l[0:1] += [5]", "n = list({3, 10, 17, 24, 31})[0]", "n = next(iter([]))", "n = isinstance(map(abs, []), filter)",
         "n = len('9' * 2000) + int('9' * 2000)",
     ],
 )  # fmt: skip
 def test_what_is_missing_cannot_be_caught(statement):
     """Python would carry out the statement, and never reach the handler."""
     body = f"l, n = [1, 2, 3], 0\ntry:\n    {statement}\nexcept Exception:\n    n = 9\nreturn [observation[:, :1] * n]"
-    with pytest.raises(RefusedError):
+    with pytest.raises(RefusedError, match=r"E-(PYTHON|NUMPY|COST|ATTRIBUTE) line 5"):
         read("import numpy as np\n" + phi_source(body), 17, 6)

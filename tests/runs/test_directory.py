@@ -67,7 +67,7 @@ def test_metrics_are_parsed_once_per_file_state(run, monkeypatch):
 
 def test_metrics_that_cannot_be_truncated(tmp_path):
     (tmp_path / "metrics.jsonl").mkdir()
-    with pytest.raises(LareError, match="cannot be written"):
+    with pytest.raises(LareError, match="cannot be read"):
         truncate_metrics(tmp_path, 0)
 
 

@@ -92,12 +92,11 @@ def compare(
     from lare_rl.compare.collect import collect_results
     from lare_rl.compare.messages import MESSAGES
     from lare_rl.compare.scores import ScoreChoice
-    from lare_rl.config.migrate import CONFIG
     from lare_rl.util.findings import render
 
     check_new_path(out, "--out", overwrite=True)
-    if out.name == CONFIG:
-        raise LareError(f"{out} is the configuration of a run: choose another --out")
+    if out.exists() and out.suffix != ".html":
+        raise LareError(f"{out} exists, and is no page (.html): choose another --out")
     results, findings = collect_results(runs, metric)
     for finding in findings:
         print_progress(render(finding, MESSAGES))

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from lare_rl.training.progress import Listener
 
 DEFAULTS = Settings()
-RUN_SETTINGS = "environments", "rollout_steps", "evaluate_every", "fit_updates", "capacity"
+ALGORITHM_DEFAULTS = "environments", "rollout_steps", "evaluate_every", "fit_updates", "capacity"
 """Settings whose defaults the algorithm chooses."""
 
 _READ_PLAN = PrimitiveConstructorSpec(
@@ -106,8 +106,9 @@ def _prepare(
     spec = resolve_task(task)
     resolved = resolve(settings, spec)
     if plan.is_run and resolved.algorithm != plan.settings.algorithm:
-        names = ", ".join(f"{name} = {getattr(resolved, name)}" for name in RUN_SETTINGS)
-        print_progress(f"from the run, which was trained with {plan.settings.algorithm}: {names}")
+        names = [name for name in ALGORITHM_DEFAULTS if plan.has_same_value(name, settings)]
+        values = ", ".join(f"{name} = {getattr(resolved, name)}" for name in names)
+        print_progress(f"from the run, which was trained with {plan.settings.algorithm}: {values or 'nothing'}")
     for name, warning in describe_unused_settings(settings, resolved, spec).items():
         # The configuration of a repeated run holds every setting, so a setting without effect is no mistake of the user.
         if not (plan.is_run and plan.has_same_value(name, settings)):

@@ -44,10 +44,17 @@ def turn_credit(
     check_new_path(out, "--out", overwrite)
     if report is not None:
         check_new_path(report, "--report", overwrite)
-    inputs = [path.resolve() for path in (rollouts, function) if path is not None]
-    for option, path, used_paths in (("--out", out, inputs[1:]), ("--report", report, [out.resolve(), *inputs])):
-        if path is not None and path.resolve() in used_paths:
-            raise LareError(f"{option} {path} is another file of this command: choose another {option}")
+    # --out may be ROLLOUTS, whose lines are kept.
+    clashes = (
+        ("--out", out, "--function", function),
+        *(
+            ("--report", report, name, path)
+            for name, path in (("--out", out), ("--function", function), ("ROLLOUTS", rollouts))
+        ),
+    )
+    for option, written, name, path in clashes:
+        if written is not None and path is not None and written.resolve() == path.resolve():
+            raise LareError(f"{option} {written} is {name}, too: choose another {option}")
     phi = None if function is None else load_turn_phi(function)
     credit = TurnCredit(lambda_)
     contents = read_rollout_file(rollouts)

@@ -7,7 +7,7 @@ from lare_rl.compare.labels import find_differences, find_origin_differences, la
 from lare_rl.compare.metric_tables import is_sweep_table
 from lare_rl.compare.results import LearningCurve, group_pairs, read_results_table, read_run_results
 from lare_rl.errors import LareError, did_you_mean
-from lare_rl.runs.directory import Run, find_run_directories, open_without_functions
+from lare_rl.runs.directory import Run, find_run_directories, is_output, open_without_functions
 from lare_rl.runs.metric_names import RETURN, SUMMED_RETURN
 from lare_rl.training.advice import describe_untrained
 from lare_rl.util.findings import Finding
@@ -24,12 +24,14 @@ def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[L
     Raises `LareError` if a path has nothing to compare, or a file is damaged.
     """
     tables = [path for path in paths if path.suffix.lower() == ".csv" and not path.is_dir()]
-    directories = [path for path in paths if path not in tables]
-    if directories:  # DIRECTORY/* of a sweep has its table, too
-        tables = [path for path in tables if not is_sweep_table(path)]
+    directories = [path for path in paths if path not in tables and (len(paths) == 1 or not is_output(path))]
     runs, findings = [], []
     if directories or not tables:
-        runs, findings = select_runs(list(map(open_without_functions, find_run_directories(directories))), metric)
+        run_directories = find_run_directories(directories)
+        runs, findings = select_runs(list(map(open_without_functions, run_directories)), metric)
+        # DIRECTORY/* of a sweep has its table, too.
+        above = {parent for directory in run_directories for parent in directory.resolve().parents}
+        tables = [path for path in tables if path.resolve().parent not in above or not is_sweep_table(path)]
         if len(directories) == 1:  # the user has not chosen a baseline
             runs.sort(key=lambda run: run.config.settings.method != "episodic")
     run_results = read_run_results(label_runs(runs), metric)

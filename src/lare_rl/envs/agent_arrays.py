@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete
 from jaxtyping import Bool, Float
 
-from lare_rl.envs.interface import AnyArray, EnvSpec, Team
+from lare_rl.envs.interface import AnyArray, EnvSpec, Team, cast_action
 from lare_rl.envs.spaces import check_spaces, flatten_value, float_array
 from lare_rl.errors import LareError, short_repr
 
@@ -50,7 +50,7 @@ class Agent:
         if isinstance(space, Discrete):
             return int(space.start) + int(np.argmax(action))
         clipped = np.clip(action.reshape(space.shape), space.low, space.high)
-        return (np.rint(clipped) if space.dtype.kind in "biu" else clipped).astype(space.dtype)
+        return cast_action(clipped, space.dtype)
 
     def flatten_observation(self, observation: Any) -> Float[np.ndarray, " observation"]:
         """Return an observation as a new vector, without the mask. Raises `ValueError` like `flatten_value`."""

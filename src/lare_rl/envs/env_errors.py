@@ -128,7 +128,13 @@ def to_float(value: Any) -> float:
     """Return a number, or the only one of an array, as a float. Raises `ValueError`, whose message is a predicate, for anything else."""
     try:
         return float(value.item() if getattr(value, "size", None) == 1 else value)
-    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last one of a tensor of several numbers
+    except (
+        TypeError,
+        ValueError,
+        OverflowError,
+        AttributeError,
+        RuntimeError,
+    ):  # the last one of a tensor of several numbers
         raise ValueError(f"is {short_repr(value)}, which is not a number") from None
 
 

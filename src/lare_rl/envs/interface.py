@@ -20,6 +20,7 @@ __all__ = [
     "Team",
     "Timestep",
     "alive_mean",
+    "cast_action",
     "team_mean",
     "team_means",
     "to_env_action",
@@ -224,14 +225,19 @@ def to_package_action(action: Float[AnyArray, "*batch action"], spec: EnvSpec) -
     """
     xp = action.__array_namespace__()
     if not spec.discrete:
-        if (dtype := spec.package_dtype) is not None:
-            action = (xp.rint(action) if dtype.kind in "biu" else action).astype(dtype)
+        if spec.package_dtype is not None:
+            action = cast_action(action, spec.package_dtype)
         return action if spec.package_shape is None else action.reshape(*action.shape[:-1], *spec.package_shape)
     number = xp.argmax(action, axis=-1)
     if not spec.choice_sizes:
         return number + spec.first_choice
     numbers = xp.stack(xp.unravel_index(number, spec.choice_sizes), axis=-1)
     return numbers.reshape(*number.shape, *(spec.package_shape or (-1,)))
+
+
+def cast_action(action: Float[AnyArray, "*shape"], dtype: np.dtype) -> Any:
+    """Return a continuous action in another type. It is rounded if that is one of integers."""
+    return (action.__array_namespace__().rint(action) if dtype.kind in "biu" else action).astype(dtype)
 
 
 def with_available_action(mask: Bool[AnyArray, "*batch actions"]) -> Bool[AnyArray, "*batch actions"]:

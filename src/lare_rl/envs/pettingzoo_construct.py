@@ -117,9 +117,8 @@ def check_team_order(names: Sequence[Any], task: TaskSpec, layout: AgentArrays) 
     for role in task.teams:
         if group_by_team(names, role)[0] != order:
             raise LareError(
-                f"task {task.name!r}: its teams have the agents {', '.join(map(str, order))}, but {role.name!r} alone has another order, "
-                f"and entries depend on it. List the teams in the order of the environment's agents ({', '.join(map(str, names))}), with "
-                "neighbouring kinds of agents in each"
+                f"task {task.name!r}: the agents have another order in the file of {role.name!r} alone, and entries depend on it. List "
+                "the teams in the order of the environment's agents, with neighbouring kinds of agents in each"
             )
 
 

@@ -1,11 +1,14 @@
 """Makes environments in other processes."""
 
+import contextlib
 import importlib
+import re
 from collections.abc import Callable
 from functools import partial
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec as RegistryEntry
+from gymnasium.envs.registration import find_highest_version, get_env_id, parse_env_id
 
 from lare_rl.envs.env_errors import close_env
 from lare_rl.envs.families import FAMILIES, GYMNASIUM, Family, find_family, make_local_env
@@ -29,20 +32,27 @@ def picklable_maker(task: TaskSpec) -> Callable[[], HostEnv]:
 
 def registry_entry(task: TaskSpec) -> RegistryEntry | None:
     """Return the entry of a task's environment in Gymnasium's registry. None if there is none, or its module was not imported."""
+    if find_family(task) is not GYMNASIUM:
+        return None
     _, name = split_environment(task.environment)
-    return gymnasium.registry.get(name) if find_family(task) is GYMNASIUM else None
+    with contextlib.suppress(gymnasium.error.Error):
+        namespace, base, version = parse_env_id(name)
+        if version is None:  # as in `gymnasium.make`
+            name = get_env_id(namespace, base, find_highest_version(namespace, base))
+    return gymnasium.registry.get(name)
 
 
-def _describe_entry(entry: RegistryEntry | None) -> tuple[str, int | None] | None:
-    """Return the maker and the time limit of a registered environment, for a comparison with another process."""
+def _describe_entry(entry: RegistryEntry | None) -> str | None:
+    """Return how a registered environment is made, for a comparison with another process."""
     if entry is None:
         return None
     maker = entry.entry_point
-    name = maker if isinstance(maker, str) else f"{maker.__module__}:{getattr(maker, '__qualname__', '')}"
-    return name, entry.max_episode_steps
+    name = maker if isinstance(maker, str | None) else f"{maker.__module__}:{getattr(maker, '__qualname__', '')}"
+    text = repr((name, entry.max_episode_steps, entry.kwargs, entry.additional_wrappers))
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", text)  # addresses of objects
 
 
-def _import_and_make(family: Family, task: TaskSpec, entry: tuple[str, int | None] | None) -> HostEnv:
+def _import_and_make(family: Family, task: TaskSpec, entry: str | None) -> HostEnv:
     if family.module != "__main__":
         importlib.import_module(family.module)
         if task.family and find_family(task) is GYMNASIUM and family != GYMNASIUM:

@@ -40,6 +40,7 @@ _FUNCTIONS_KEY = REPLY_KEYS[-1]
 _FENCED_BLOCK = re.compile(r"```[^\n`]*+\n(?P<code>.*?)(?:```|\Z)", re.DOTALL)
 # Some models write their reasoning first, which may contain drafts of the answer.
 _REASONING_END = re.compile(r"</think(?:ing)?>")
+_FUNCTION_START = re.compile(r"^\s*def \w+\(", re.MULTILINE)
 _OBJECT_START = re.compile(r'\{\s*"')
 
 
@@ -68,9 +69,8 @@ def parse_reply(text: str) -> Reply:
         raise MalformedReplyError(f"the reply's JSON object does not have the requested form: {error}") from error
     fences = list(_FENCED_BLOCK.finditer(reply.functions))
     # A fence may also stand in the docstring of a function that has no fence.
-    is_fenced = "def " not in _FENCED_BLOCK.sub("", reply.functions) and any(
-        "def " in fence["code"] for fence in fences
-    )
+    is_fenced = not _FUNCTION_START.search(_FENCED_BLOCK.sub("", reply.functions))
+    is_fenced &= any(_FUNCTION_START.search(fence["code"]) for fence in fences)
     functions = _join_functions(fences) if is_fenced else reply.functions
     texts = {"understand": reply.understand, "analyze": reply.analyze, "functions": functions}
     for value in texts.values():

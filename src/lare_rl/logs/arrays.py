@@ -30,9 +30,7 @@ class ArrayLog(Log):
     def check_output(self, out: str | Path, overwrite: bool) -> None:
         super().check_output(out, overwrite)
         if (suffix := Path(out).suffix) in LOG_SUFFIXES:
-            raise LareError(
-                f"{out} cannot be written: this log becomes a directory of .npz files, whose name has no {suffix}"
-            )
+            raise LareError(f"{out} cannot be written: this log is written as a directory, so leave out {suffix}")
 
     def write(self, out: str | Path, episodes: Iterable[RelabelledEpisode], overwrite: bool, comment: str) -> Path:
         with atomic_output(Path(out), overwrite) as directory:

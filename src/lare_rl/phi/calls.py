@@ -177,8 +177,9 @@ def make_class(runtime: Runtime, statement: ast.ClassDef, scope: Scope) -> Class
         statement.name, dict(body), _resolution_order(runtime, program_bases), fields, "typing.NamedTuple" in names
     )
     for value in cls.attributes.values():
-        if isinstance(value, Function):
-            value.owner = cls
+        function = value.function if isinstance(value, Decorated) else value
+        if isinstance(function, Function):
+            function.owner = cls
     return cls
 
 
@@ -233,6 +234,8 @@ def class_attribute(runtime: Runtime, owner: Class | Instance, name: str) -> Any
         return owner.name if name == "__name__" else _unwrap(runtime, owner, owner.find(name))
     if name in owner.attributes:
         return owner.attributes[name]
+    if name == "__init__" and owner.bound_to is not None and not owner.cls.has(name):
+        return Bound(lambda: None)  # that of `object`
     if not owner.cls.has(name) and owner.cls.has("__getattr__"):
         return runtime.call(class_attribute(runtime, owner, "__getattr__"), [name], {})
     value, target = owner.cls.find(name), owner if owner.bound_to is None else owner.bound_to

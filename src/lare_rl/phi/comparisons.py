@@ -46,13 +46,20 @@ def compare(runtime: Runtime, op: ast.cmpop, x: Any, y: Any) -> Any:
         pass
     elif isinstance(x, Set) and isinstance(y, Set):
         x, y = set(x), set(y)
+    elif isinstance(x, Iterator) and isinstance(op, (ast.Eq, ast.NotEq)):
+        return (x is y) == isinstance(op, ast.Eq)
     elif isinstance(x, Instance) or isinstance(y, Instance):
         return _compare_instances(runtime, op, x, y)
     elif isinstance(x, Operand) != isinstance(y, Operand):
         if x is None or y is None:
             return isinstance(op, ast.NotEq)
         x, y = (value if isinstance(value, Operand) else as_array(value) for value in (x, y))
-    return COMPARISONS[type(op)](x, y)
+    try:
+        return COMPARISONS[type(op)](x, y)
+    except TypeError:
+        if isinstance(op, (ast.In, ast.NotIn)):
+            raise
+        raise TypeError(f"{describe(x)} and {describe(y)} have no order") from None
 
 
 def _is_same_type(x: Symbol, y: Symbol | str, *, strict: bool) -> bool:

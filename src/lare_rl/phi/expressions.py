@@ -69,8 +69,8 @@ def get_item(runtime: Runtime, container: Any, index: Any) -> Any:
     match container:
         case Array() | Complex():
             return container[index]
-        case Set():
-            raise TypeError("a set has no order: it cannot be indexed")
+        case Set() | Iterator():
+            raise TypeError(f"{describe(container)} cannot be indexed")
         case dict():
             return container[check_key(index)]
         case list() | tuple() | range() | str():
@@ -177,7 +177,9 @@ def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
         case ast.FormattedValue(value=value, conversion=conversion, format_spec=spec):
             format_spec, value = "" if spec is None else runtime.evaluate(spec, scope), runtime.evaluate(value, scope)
             return format_value(
-                runtime.meter, convert_value(runtime.meter, value, chr(max(conversion, 0))), format_spec
+                runtime.meter,
+                convert_value(runtime.meter, value, chr(conversion) if conversion >= 0 else None),
+                format_spec,
             )
         case ast.Yield() | ast.YieldFrom():
             return _evaluate_yield(runtime, node, scope)

@@ -35,6 +35,8 @@ COMPARISONS = {
 REDUCTIONS = {
     "sum": "ReduceSum", "prod": "ReduceProd", "max": "ReduceMax", "min": "ReduceMin", "any": "ReduceMax", "all": "ReduceMin",
 }  # fmt: skip
+MAX_SHIFT = 31
+"""The largest number of bits that an integer of 32 bits is shifted by."""
 COMPOSED: dict[str, Callable[..., str]] = {
     "not_equal": lambda op, x, y: op("Not", op("Equal", x, y)),
     "isfinite": lambda op, x: op("Not", op("Or", op("IsNaN", x), op("IsInf", x))),
@@ -58,8 +60,8 @@ def _composed(function: Callable[..., str]) -> Callable[..., str]:
 def log1p(op: Callable[..., str], x: str) -> str:
     """Correct the rounding error of u = 1 + x (HP-15C Advanced Functions Handbook, 1982): log(u) x / (u - 1)."""
     u = op("Add", x, 1.0)
-    is_exact = op("Or", op("Equal", u, 1.0), op("Equal", u, math.inf))
-    return op("Where", is_exact, x, op("Div", op("Mul", op("Log", u), x), op("Sub", u, 1.0)))
+    is_limit = op("Or", op("Equal", u, 1.0), op("Equal", u, math.inf))
+    return op("Where", is_limit, x, op("Mul", op("Log", u), op("Div", x, op("Sub", u, 1.0))))
 
 
 @_composed
@@ -92,6 +94,8 @@ def copysign(op: Callable[..., str], x: str, y: str) -> str:
 def arctan2(op: Callable[..., str], y: str, x: str) -> str:
     half_turn = op("Where", _is_negative(op, y), np.float32(-math.pi), np.float32(math.pi))
     quarter_turn = op("Mul", op("Sign", y), math.pi / 2)
+    infinite = op("And", op("IsInf", y), op("IsInf", x))  # they have no quotient: as if both were 1 or -1
+    y, x = (op("Where", infinite, op("Sign", value), value) for value in (y, x))
     angle = op("Atan", op("Div", y, x))
     on_axis = op("Where", op("Equal", y, 0.0), op("Where", _is_negative(op, x), half_turn, y), quarter_turn)
     half_plane = op("Where", op("Equal", x, 0.0), on_axis, op("Add", angle, half_turn))
@@ -107,8 +111,6 @@ def _power_of_two(op: Callable[..., str], exponent: str) -> str:
     return op("Pow", np.array(2), op("Max", op("Min", exponent, np.array(MAX_SHIFT)), np.array(0)))
 
 
-MAX_SHIFT = 31
-"""The largest number of bits that an integer of 32 bits is shifted by."""
 DTYPES = {"float": np.float32, "int": np.int64, "bool": np.bool_}
 """The types of inputs and outputs."""
 
@@ -305,10 +307,11 @@ class _Writer:
         op = self.op
         rest = op("Mod", x, y, fmod=1)
         differs = op("Xor", op("Less", rest, 0.0), op("Less", y, 0.0))
-        rest = op("Where", op("And", differs, op("Not", op("Equal", rest, 0.0))), op("Add", rest, y), rest)
+        differs = op("And", differs, op("Not", op("Equal", rest, 0.0)))
         if name == "remainder":
-            return rest
+            return op("Where", differs, op("Add", rest, y), rest)
         quotient = op("Div", op("Sub", x, rest), y)
+        quotient = op("Where", differs, op("Sub", quotient, 1.0), quotient)
         floor = op("Floor", quotient)
         floor = op("Where", op("Greater", op("Sub", quotient, floor), 0.5), op("Add", floor, 1.0), floor)
         return op("Where", op("Equal", y, 0.0), op("Div", x, y), floor)

@@ -22,6 +22,7 @@ from lare_rl.phi.values import (
     Class,
     ContinueSignal,
     Instance,
+    Iterator,
     ProgramError,
     ReturnSignal,
     Scope,
@@ -168,12 +169,16 @@ def _set_item(runtime: Runtime, container: Any, index: Any, value: Any) -> None:
     runtime.meter.pay_for_all_within([index, value])
     if isinstance(container, dict) and not isinstance(container, Set):
         container[check_key(index)] = value
-    elif isinstance(container, list) and isinstance(index, slice):
-        raise RefusedError("E-PYTHON", "nothing can be written into a slice of a list")
-    elif isinstance(container, (Array, list)):
+    elif isinstance(container, (Array, list)) and not isinstance(container, Iterator):
+        _check_no_list_slice(container, index)
         container[index] = value
     else:
         raise TypeError(f"nothing can be written into {describe(container)}")
+
+
+def _check_no_list_slice(container: Any, index: Any) -> None:
+    if isinstance(container, list) and isinstance(index, slice):
+        raise RefusedError("E-PYTHON", "nothing can be written into a slice of a list")
 
 
 def _augment(runtime: Runtime, statement: ast.AugAssign, scope: Scope) -> None:
@@ -181,6 +186,7 @@ def _augment(runtime: Runtime, statement: ast.AugAssign, scope: Scope) -> None:
     target, container, index = statement.target, None, None
     if isinstance(target, ast.Subscript):
         container, index = runtime.evaluate(target.value, scope), runtime.evaluate(target.slice, scope)
+        _check_no_list_slice(container, index)
         old = runtime.item(container, index)
     elif isinstance(target, ast.Attribute):
         container = runtime.evaluate(target.value, scope)

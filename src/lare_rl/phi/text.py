@@ -12,7 +12,7 @@ from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import Operand
 from lare_rl.phi.runtime import Meter, Runtime, check_key, check_text, check_text_length, make_set
-from lare_rl.phi.values import Keys, Set, Symbol, value_type
+from lare_rl.phi.values import FrozenSet, Iterator, Keys, Set, Symbol, value_type
 
 __all__ = ["METHODS", "call_method", "combine_values", "convert_value", "format_value", "represent_value"]
 
@@ -29,6 +29,7 @@ METHODS: dict[type, frozenset[str]] = {
     list: frozenset("append extend insert pop copy index count reverse sort remove clear".split()),
     dict: frozenset("get items keys values pop update copy setdefault clear".split()),
     Set: frozenset("add union intersection difference issubset issuperset discard copy update".split()),
+    FrozenSet: frozenset("union intersection difference issubset issuperset copy".split()),
 }  # fmt: skip
 """Methods that a program can call, by the type of their owner."""
 
@@ -41,6 +42,8 @@ def format_value(meter: Meter, value: Any, spec: str) -> str:
         value = value.constant.tolist()
     if not FORMAT.fullmatch(spec):
         raise RefusedError("E-PYTHON", f"the format {spec[:40]!r} is not available")
+    if spec and (value is None or isinstance(value, (list, tuple, dict))):
+        raise TypeError(f"{value_type(value)} has no format")
     if isinstance(value, str) or (spec and isinstance(value, (bool, int, float))):
         meter.pay_for_all_within([value])
         return check_text(format(value, spec))
@@ -51,13 +54,12 @@ def convert_value(meter: Meter, value: Any, conversion: str | None) -> Any:
     """Apply the conversion of a field: !s, !r or !a."""
     if conversion == "s":
         return format_value(meter, value, "")
-    if conversion == "r":
-        return represent_value(meter, value)
-    return (
-        check_text(ascii(value) if isinstance(value, str) else represent_value(meter, value))
-        if conversion == "a"
-        else value
-    )
+    if conversion is None:
+        return value
+    if conversion not in ("r", "a"):
+        raise ValueError(f"there is no conversion {conversion[:10]!r}")
+    text = represent_value(meter, value)
+    return text if conversion == "r" else check_text(text.encode("ascii", "backslashreplace").decode())
 
 
 def represent_value(meter: Meter, value: Any) -> str:
@@ -83,6 +85,8 @@ def _represent(value: Any) -> str:
         return repr(value) if isinstance(value, str) else str(value)
     if isinstance(value, Keys):
         return f"dict_keys([{', '.join(map(_represent, value))}])"
+    if isinstance(value, FrozenSet):
+        return f"frozenset({_represent(Set(value)) if value else ''})"
     if isinstance(value, Set):
         return f"{{{', '.join(map(_represent, value.entries))}}}" if value else "set()"
     if isinstance(value, dict):
@@ -96,6 +100,8 @@ def _represent(value: Any) -> str:
 
 def combine_values(meter: Meter, name: str, x: Any, y: Any) -> Any:
     """Apply an operator, by the name of Python's method, to texts, lists, dictionaries or sets."""
+    if isinstance(x, Iterator) or isinstance(y, Iterator):
+        raise TypeError(f"unsupported operand types for {name}: {value_type(x)} and {value_type(y)}")
     for value, times in ((x, y), (y, x)):
         if name == "mul" and isinstance(value, (list, tuple, str)) and isinstance(times, int):
             meter.pay_for_list(len(value) * max(times, 0))
@@ -108,7 +114,8 @@ def combine_values(meter: Meter, name: str, x: Any, y: Any) -> Any:
     if isinstance(x, Set) and isinstance(y, Set) and name in ("or", "and", "sub", "xor"):
         meter.pay(len(x) + len(y))
         keeps = {"or": operator.or_, "and": operator.and_, "sub": operator.gt, "xor": operator.ne}[name]
-        return Set({key: None for key in x | y if keeps(key in x, key in y)})
+        kind = FrozenSet if isinstance(x, FrozenSet) else Set
+        return kind({key: None for key in x | y if keeps(key in x, key in y)})
     if name == "mod" and isinstance(x, str):
         values = y if isinstance(y, tuple) else (y,)
         texts = sum(len(value) for value in values if isinstance(value, str))
@@ -190,7 +197,7 @@ def _dict_method(
 
 def _set_method(runtime: Runtime, values: Set, name: str, args: Sequence[Any]) -> Any:
     if name == "copy":
-        return Set(values)
+        return type(values)(values)
     if name == "discard":
         return values.pop(check_key(args[0]), None)
     sets = [make_set([x] if name == "add" else runtime.items(x)) for x in args]
@@ -203,4 +210,4 @@ def _set_method(runtime: Runtime, values: Set, name: str, args: Sequence[Any]) -
             values.update(entries)
         return None
     operation = {"union": "or", "intersection": "and", "difference": "sub"}[name]
-    return functools.reduce(lambda x, y: combine_values(runtime.meter, operation, x, y), sets, Set(values))
+    return functools.reduce(lambda x, y: combine_values(runtime.meter, operation, x, y), sets, type(values)(values))

@@ -96,10 +96,32 @@ class Instance(_Value):
 class Set(dict):
     """A set of the program. It keeps the order in which its entries were added."""
 
+    __hash__ = None
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Set) and self.keys() == other.keys()
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
     @property
     def entries(self) -> list[Any]:
-        """The entries in the order of CPython, if all are numbers. That of texts differs from process to process."""
-        return list(set(self)) if all(isinstance(entry, (bool, int, float)) for entry in self) else list(self)
+        """The entries in the order of CPython, if all are numbers. That of texts differs from process to process.
+
+        Raises `RefusedError` if the order of numbers depends on how the set was made.
+        """
+        if not all(isinstance(entry, (bool, int, float)) for entry in self):
+            return list(self)
+        rising, falling = sorted(self), sorted(self, reverse=True)
+        ways = set(self), set(rising), set(falling), set(frozenset(self)), frozenset(self)
+        first, *orders = map(list, ways)
+        if any(order != first for order in orders):
+            raise RefusedError("E-PYTHON", "the order of the entries of a set is not certain: use sorted()")
+        return first
+
+
+class FrozenSet(Set):
+    """A frozenset of the program."""
 
 
 class Keys(Set):
@@ -189,8 +211,8 @@ PYTHON_ERRORS = (ArithmeticError, AttributeError, LookupError, NameError, TypeEr
 """The errors that Python and NumPy would raise, too. A program can catch them; it cannot catch `RefusedError`."""
 
 _TYPE_NAMES: dict[type, str] = {
-    Set: "set", Keys: "dict_keys", Iterator: "iterator", Bound: "function", Class: "type", BatchSize: "int", Symbol: "type",
-    Function: "function",
+    Set: "set", FrozenSet: "frozenset", Keys: "dict_keys", Iterator: "iterator", Bound: "function", Function: "function",
+    Class: "type", Symbol: "type", BatchSize: "int",
 }  # fmt: skip
 
 

@@ -113,7 +113,6 @@ class RunSummary:
     """The command that continues the run."""
     evaluate: str = "lare-rl evaluate RUN"
     """The command that evaluates the final policies."""
-    """Quoted for a shell."""
     task: str = "TASK"
     """The name of a shipped task, or a placeholder for a task file, which ends in `.toml`."""
 

@@ -41,6 +41,7 @@ __all__ = [
     "function_filename",
     "function_paths",
     "function_suffix",
+    "is_output",
     "lock_run",
     "open_run",
     "open_without_functions",
@@ -230,6 +231,11 @@ def lock_run(run: Run) -> Iterator[None]:
         yield
 
 
+def is_output(path: Path) -> bool:
+    """Return whether a path is one of the files that LaRe writes beside runs, by its name."""
+    return path.is_file() and path.suffix in OUTPUT_SUFFIXES
+
+
 def find_run_directories(paths: Sequence[Path]) -> list[Path]:
     """Return the runs among some paths and up to three levels below them, in the order of the paths, each once.
 
@@ -240,8 +246,8 @@ def find_run_directories(paths: Sequence[Path]) -> list[Path]:
     """
     directories: dict[Path, Path] = {}  # by resolved path
     for path in paths:
-        is_log_of_run = path.suffix == ".log" and path.with_suffix("").is_dir()
-        if path.is_file() and (is_log_of_run or (len(paths) > 1 and path.suffix in OUTPUT_SUFFIXES)):
+        is_log_of_run = path.suffix == ".log" and path.is_file() and path.with_suffix("").is_dir()
+        if is_log_of_run or (len(paths) > 1 and is_output(path)):
             continue
         # The directory of a run that was killed while it was created has a name that begins with a dot.
         configs = [config for depth in range(4) for config in path.glob("[!.]*/" * depth + CONFIG)]

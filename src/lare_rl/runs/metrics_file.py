@@ -53,8 +53,10 @@ def truncate_metrics(directory: Path, n_bytes: int) -> None:
     Raises `LareError` if lines from before the checkpoint are missing or changed, or the file cannot be written.
     """
     path = directory / METRICS_FILE
-    with report_write_error(path):
+    try:
         content = path.read_bytes() if path.exists() else b""
+    except OSError as error:
+        raise LareError(f"{path} cannot be read: {error.strerror or error}") from error
     if len(content) < n_bytes:
         raise LareError(
             f"{path} has {len(content)} bytes, and the checkpoint needs {n_bytes}: was it copied during training? Copy the run again"
@@ -86,7 +88,7 @@ def is_count(value: Any) -> bool:
     return type(value) is int and 0 <= value <= MAX_INTEGER
 
 
-def is_metric(value: Any) -> bool:
+def _is_metric(value: Any) -> bool:
     """Return whether a value of JSON is a number that a metric can have."""
     limits = {int: MAX_INTEGER, float: MAX_VALUE}
     return type(value) in limits and abs(value) <= limits[type(value)]  # false for NaN
@@ -97,5 +99,5 @@ def _is_evaluation(line: Any) -> bool:
     return (
         isinstance(line, dict)
         and all(is_count(line.get(name)) for name in ("step", "seed"))
-        and all(value is None or is_metric(value) for value in line.values())
+        and all(value is None or _is_metric(value) for value in line.values())
     )

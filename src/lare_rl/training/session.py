@@ -288,7 +288,7 @@ class Session:
         try:
             self.best = load_best(self.run.checkpoint, actor_shape(self.config, n_seeds), n_seeds)
         except LareError as error:
-            return [f"the best policies so far are lost, and the next evaluations choose new ones: {error}"]
+            return [f"the best policies so far are lost, and only later evaluations choose new ones: {error}"]
         return []
 
     def close(self) -> None:

@@ -175,7 +175,8 @@ def _run_to_end(
             session.save()  # so that there is always a checkpoint
         else:
             truncate_metrics(run.directory, session.metrics_bytes)
-        write_config(run.directory, run.config)  # an extension is written only after the run could be restored
+        if run.config.settings.steps != earlier_steps:
+            write_config(run.directory, run.config)  # the run could be restored
         if tensorboard:
             listeners = [*listeners, TensorBoard(run.directory / EVENTS_DIRECTORY, session.step, run.seeds)]
         messages = [*messages, *restore_messages, *_introduction(session, earlier_steps)]

@@ -12,7 +12,7 @@ from lare_rl.phi.arrays import Array
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, builtin_variants, check_key, make_set, varies
 from lare_rl.phi.text import format_value, represent_value
-from lare_rl.phi.values import Bound, Class, Instance, Iterator, Symbol, describe
+from lare_rl.phi.values import Bound, Class, FrozenSet, Instance, Iterator, Set, Symbol, describe
 
 ADDITION = Symbol("operator.add")
 
@@ -27,7 +27,7 @@ def len_(runtime: Runtime, x: Any) -> Any:
         return runtime.call(runtime.attribute(x, "__len__"), [], {})
     if isinstance(x, Instance) and x.cls.is_tuple:
         return len(x.cls.fields or ())
-    if isinstance(x, (list, tuple, dict, range, str)):
+    if isinstance(x, (list, tuple, dict, range, str)) and not isinstance(x, Iterator):
         return len(x)
     raise TypeError("len() of a value without entries")
 
@@ -41,12 +41,17 @@ def range_(runtime: Runtime, *ends: Any) -> range:
 
 @builtin("sum")
 def sum_(runtime: Runtime, values: Any, start: Any = 0) -> Any:
-    return functools.reduce(lambda x, y: runtime.binary(ast.Add(), x, y), runtime.items(values), start)
+    return functools.reduce(lambda x, y: runtime.binary(ast.Add(), x, y), _unordered(runtime, values), start)
+
+
+def _unordered(runtime: Runtime, values: Any) -> Sequence[Any]:
+    """Return entries of which the order does not matter."""
+    return list(values) if isinstance(values, Set) else runtime.items(values)
 
 
 @builtin_variants({"max": max, "min": min})
 def max_or_min(function: Callable[..., Any], runtime: Runtime, /, *values: Any, key: Any = None, **default: Any) -> Any:
-    items, name = runtime.items(values[0]) if len(values) == 1 else values, function.__name__
+    items, name = _unordered(runtime, values[0]) if len(values) == 1 else values, function.__name__
     if varies(items):
         hint = f"use np.{name}imum, or np.{name} along axis=1"
         raise RefusedError("E-FLOW", f"{name}() of numbers that differ from row to row: {hint}")
@@ -55,7 +60,7 @@ def max_or_min(function: Callable[..., Any], runtime: Runtime, /, *values: Any, 
 
 @builtin("sorted")
 def sorted_(runtime: Runtime, values: Any, *, key: Any = None, reverse: Any = False) -> list[Any]:
-    items = list(runtime.items(values))
+    items = list(_unordered(runtime, values))
     if varies(items):
         raise RefusedError("E-FLOW", "sorted() of numbers that differ from row to row: use np.sort along axis=1")
     return sorted(items, key=_sort_key(runtime, key), reverse=bool(reverse))
@@ -72,7 +77,7 @@ def _sort_key(runtime: Runtime, key: Any) -> Callable[[Any], Any] | None:
 
 @builtin("dict", "collections.OrderedDict")
 def dict_(runtime: Runtime, values: Any = (), /, **more: Any) -> dict[Any, Any]:
-    if isinstance(values, dict):
+    if isinstance(values, dict) and not isinstance(values, Set):
         runtime.meter.pay_for_list(len(values))
         return dict(values) | more
     return {check_key(key): value for key, value in map(runtime.items, runtime.items(values))} | more
@@ -98,8 +103,10 @@ def zip_(runtime: Runtime, *values: Any, strict: Any = False) -> Iterator:
 def next_(_: Runtime, iterator: Any, *default: Any) -> Any:
     if not isinstance(iterator, Iterator):
         raise TypeError(f"next() of {describe(iterator)}, which is no iterator")
-    if not iterator and not default:
-        raise TypeError("next() of an iterator without further entries: give a default, next(iterator, None)")
+    if not iterator and not default:  # Python raises StopIteration
+        raise RefusedError(
+            "E-PYTHON", "next() of an iterator without further entries: give a default, next(iterator, None)"
+        )
     return iterator.pop(0) if iterator else default[0]
 
 
@@ -122,9 +129,11 @@ def _make(convert: Callable[[Sequence[Any]], Any]) -> Callable[..., Any]:
 BUILTINS |= {
     "list": _make(list),
     "tuple": _make(tuple),
-    "set": _make(make_set),
-    "frozenset": _make(make_set),
-    "iter": _make(Iterator),
+    "set": lambda runtime, values=(): make_set(runtime.meter.pay_for_list(_unordered(runtime, values))),
+    "frozenset": lambda runtime, values=(): FrozenSet(
+        make_set(runtime.meter.pay_for_list(_unordered(runtime, values)))
+    ),
+    "iter": lambda runtime, values: values if isinstance(values, Iterator) else _make(Iterator)(runtime, values),
     "reversed": _make(lambda values: Iterator(list(values)[::-1])),
     "all": lambda runtime, values: all(map(runtime.truth, runtime.next_items(values))),
     "any": lambda runtime, values: any(map(runtime.truth, runtime.next_items(values))),

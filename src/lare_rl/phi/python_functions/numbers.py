@@ -7,6 +7,7 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
+from lare_rl.errors import short_repr
 from lare_rl.phi.arrays import Array
 from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.limits import RefusedError
@@ -34,7 +35,10 @@ def number(kind: type, _: Runtime, /, x: Any = 0) -> Any:
         raise RefusedError("E-COST", f"{name}() of a text with more than {MAX_DIGITS} characters")
     if not isinstance(x, (bool, int, float, str, Array)):
         raise TypeError(f"{name}() of a value that is no number")
-    return check_number(kind(x))
+    try:
+        return check_number(kind(x))
+    except ValueError:
+        raise ValueError(f"{name}() of {short_repr(x)}") from None
 
 
 @builtin("round")

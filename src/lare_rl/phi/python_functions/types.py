@@ -1,5 +1,7 @@
 """Functions of types and attributes: isinstance, getattr, namedtuple, types of numbers, errors."""
 
+import math
+import types
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +13,19 @@ from lare_rl.phi.numpy_functions import FUNCTIONS
 from lare_rl.phi.numpy_functions.registry import KIND_OF_DTYPE, astype, dtype_kind, dtype_name
 from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, check_text
 from lare_rl.phi.text import format_value
-from lare_rl.phi.values import Bound, Class, Decorated, Function, Instance, Iterator, Keys, Set, Symbol, value_type
+from lare_rl.phi.values import (
+    Bound,
+    Class,
+    Decorated,
+    FrozenSet,
+    Function,
+    Instance,
+    Iterator,
+    Keys,
+    Set,
+    Symbol,
+    value_type,
+)
 
 _EXCEPTIONS: list[type[Exception]] = [
     Exception, ValueError, TypeError, IndexError, KeyError, LookupError, ZeroDivisionError, ArithmeticError, AttributeError,
@@ -27,7 +41,8 @@ _CALLABLE = ["collections.abc.Callable", "typing.Callable"]
 _REAL = ["numbers.Number", "numbers.Real"]
 _PARENTS = {
     "bool": ["int", *_REAL, "numbers.Integral"], "int": [*_REAL, "numbers.Integral"], "float": _REAL, "list": _SEQUENCE,
-    "tuple": _SEQUENCE, "str": _SEQUENCE, "range": _SEQUENCE, "set": _ITERABLE, "iterator": _ITERABLE, "dict_keys": _ITERABLE,
+    "tuple": _SEQUENCE, "str": _SEQUENCE, "range": _SEQUENCE, "set": _ITERABLE, "frozenset": _ITERABLE, "iterator": _ITERABLE,
+    "dict_keys": _ITERABLE,
     "dict": _MAPPING, "function": _CALLABLE, "np.ndarray": _ITERABLE, "type": _CALLABLE,
 }  # fmt: skip
 """The types above a type."""
@@ -38,32 +53,41 @@ _NUMPY_SCALARS = {
 """The types of NumPy's numbers: float64 is a float of Python, too."""
 
 
-_INDISTINCT = frozenset("frozenset map filter zip enumerate reversed".split())
-"""Types whose values a program has as a `Set` or an `Iterator`."""
+_ITERATORS = frozenset("map filter zip enumerate reversed".split())
+"""Types whose values a program has as an `Iterator`."""
 _PYTHON_TYPES: dict[type, type] = {
-    Set: set, Keys: type({}.keys()), Iterator: type(iter([])),
+    Set: set, FrozenSet: frozenset, Keys: type({}.keys()), Iterator: type(iter([])),
+    **dict.fromkeys((Function, Bound), types.FunctionType),
     **{cls: cls for cls in (str, list, tuple, dict, range, bool, int, float, complex, slice, type(None))},
 }  # fmt: skip
 """The types of Python that the types of values stand for."""
+_NUMPY_TYPES = {"float": np.float64, "int": np.int64, "bool": np.bool_}
+"""The types of NumPy's numbers, by their kinds."""
+_MODULES = {"np": np, "math": math}
 
 
 @builtin("isinstance")
 def isinstance_(_: Runtime, value: Any, classes: Any) -> bool:
     classes = classes if isinstance(classes, tuple) else (classes,)
     if isinstance(value, Instance):
-        types = [value.cls, *value.cls.bases, Symbol("object"), *([Symbol("tuple")] if value.cls.is_tuple else [])]
-        return any(cls in classes for cls in types)
-    if isinstance(value, (Set, Iterator)) and any(
-        isinstance(cls, Symbol) and cls.name in _INDISTINCT for cls in classes
-    ):
-        raise RefusedError(
-            "E-PYTHON", "isinstance() cannot tell such types apart: set and frozenset, or kinds of iterators"
-        )
+        instance_types = [
+            value.cls,
+            *value.cls.bases,
+            Symbol("object"),
+            *([Symbol("tuple")] if value.cls.is_tuple else []),
+        ]
+        for method, names in (("__call__", _CALLABLE), ("__iter__", _ITERABLE)):
+            instance_types += map(Symbol, names) if value.cls.has(method) else []
+        return any(cls in classes for cls in instance_types)
     name = value_type(value).name
     names = [name, "object", *_PARENTS.get(name, ())]
     if isinstance(value, Array) and value.is_number:
         names = [*_NUMPY_SCALARS[value.kind], "np.generic", "object"]
-    return any(isinstance(cls, Symbol) and cls.name in names for cls in classes)
+    if any(isinstance(cls, Symbol) and cls.name in names for cls in classes):
+        return True
+    if isinstance(value, Iterator) and any(isinstance(cls, Symbol) and cls.name in _ITERATORS for cls in classes):
+        raise RefusedError("E-PYTHON", "isinstance() cannot tell kinds of iterators apart")
+    return False
 
 
 @builtin("hasattr")
@@ -71,15 +95,24 @@ def hasattr_(runtime: Runtime, value: Any, name: str) -> bool:
     """Return whether a value has an attribute. No code of the program is carried out to find out."""
     runtime.meter.pay(len(name) + 100)
     if isinstance(value, Instance):
-        return name in value.attributes or value.cls.has(name) or value.cls.has("__getattr__")
+        is_own = name in value.attributes or value.cls.has(name) or value.cls.has("__getattr__")
+        return is_own or name in dir(object)
     if isinstance(value, Class):
-        return value.has(name)
+        return value.has(name) or name in dir(type)
     try:
         runtime.attribute(value, name)
-    except (RefusedError, AttributeError):  # it may be one that Python's or NumPy's type has
-        python_type = np.ndarray if isinstance(value, Array) else _PYTHON_TYPES.get(type(value))
-        return name in dir(python_type) if python_type else False
+    except (RefusedError, AttributeError):  # it may be one that Python or NumPy has
+        return name in dir(_python_counterpart(value))
     return True
+
+
+def _python_counterpart(value: Any) -> Any:
+    """Return the module or the type of Python or NumPy that a value stands for."""
+    if isinstance(value, Symbol):
+        return _MODULES.get(value.name, types.FunctionType)
+    if isinstance(value, Array):
+        return _NUMPY_TYPES[value.kind] if value.is_number else np.ndarray
+    return _PYTHON_TYPES.get(type(value), object)
 
 
 @builtin("getattr")
@@ -135,7 +168,8 @@ def _is_callable(value: Any) -> bool:
     if isinstance(value, Instance):
         return value.cls.has("__call__")
     if isinstance(value, Symbol):
-        return value.name in BUILTINS or value.name.removeprefix("np.") in FUNCTIONS
+        short = value.name.removeprefix("np.")
+        return value.name in BUILTINS or short in FUNCTIONS or short in KIND_OF_DTYPE or short == "ndarray"
     return isinstance(value, (Function, Bound, Class))
 
 
