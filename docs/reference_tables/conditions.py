@@ -23,7 +23,8 @@ CONDITIONS: dict[str, dict[str, str]] = {
         "equal_returns": "All episodes have the same return.",
     },
     "The outcome": {
-        "learned": f"The final return is {CLEAR_ERRORS} standard errors above random actions and above the policy before training.",
+        "learned": f"The final return, of sampled or of the most likely actions, is {CLEAR_ERRORS} standard errors above random actions; "
+        "and that of actions as in training is as much above the policy before training, if that was evaluated.",
         "some_seeds_learned": f"Otherwise, if one seed is {SEED_STDS} standard deviations of their returns above random actions, and above "
         "its policy before training.",
         "may_beat_random": f"The final return is {POSSIBLE_ERRORS} standard error above random actions, but not {CLEAR_ERRORS}.",

@@ -60,9 +60,9 @@ def test_posterior_is_that_of_one_large_matrix(prefixes):
     )
     y_std = sums.problem.y_std
     mean, covariance, _ = dense_posterior(x, y, weight, group, best.alpha / y_std**2, best.beta / y_std**2)
-    np.testing.assert_allclose(fit.weight, mean[:n_features], rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(fit.coefficients, mean[:n_features], rtol=1e-5, atol=1e-8)
     np.testing.assert_allclose(fit.intercept, mean[n_features + 1 :], rtol=1e-5, atol=1e-8)
-    np.testing.assert_allclose(fit.mean - fit.x_mean @ fit.weight, mean[n_features], rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(fit.mean - fit.x_mean @ fit.coefficients, mean[n_features], rtol=1e-5, atol=1e-8)
     covariance_v = (fit.root.T @ fit.root)[:n_features, :n_features]
     np.testing.assert_allclose(covariance_v, covariance[:n_features, :n_features], rtol=1e-4, atol=1e-9)
 
@@ -90,5 +90,5 @@ def test_precisions_maximise_the_evidence(prefixes):
 def test_equal_outcomes_give_no_weight(prefixes, outcome):
     x, y, weight, group, n = prefixes
     fit = fit_linear(x, np.full_like(y, outcome), weight, group, n)
-    assert not fit.weight.any()
+    assert not fit.coefficients.any()
     assert fit.mean == pytest.approx(outcome)

@@ -39,7 +39,7 @@ def linear_fit(table, x):
     rows = BETA * np.column_stack([sums - counts[:, None] * x_mean, counts]) / precision[:, None]
     return PrefixFit(
         x_mean=x_mean,
-        weight=mean[:n],
+        coefficients=mean[:n],
         mean=float(mean[n] + mean[:n] @ x_mean),
         intercept=mean[n + 1 :],
         root=np.linalg.cholesky(shift @ covariance[: n + 1, : n + 1] @ shift.T).T,

@@ -36,7 +36,7 @@ MESSAGES = {
     "reached": "The return is {return_:number}{std} after {steps:,} steps{seeds}{deterministic}",
     "deterministic": ", by sampled actions as in training; the most likely action gets {return_:number}",
     "deterministic_is_judged": (
-        ", by sampled actions as in training; the most likely action gets {return_:number}, and this verdict is about it (`lare-rl "
+        ", by sampled actions as in training. The verdict is about the most likely actions, which get {return_:number} (`lare-rl "
         "evaluate --deterministic`)"
     ),
     "std": " ± {std:std}",

@@ -187,7 +187,7 @@ class RunSummary:
         """Return whether the mean improvement of the seeds since before training exceeds `n_errors` of its standard errors."""
         if self.initial_returns is None:
             return True
-        improvements = finite(self.judged_returns - self.initial_returns)
+        improvements = finite(self.returns[:, -1] - self.initial_returns)  # both by actions as in training
         error = grouped_standard_error(improvements, max(math.sqrt(2) * self.episode_error, MIN_ERROR))
         return bool(improvements.mean() > n_errors * error)
 

@@ -71,8 +71,8 @@ MESSAGES = {
     "guessed limit": " Its max_episode_steps = {limit} may be the draft's guess, too.",
     "provisional": "Provisional, from the few episodes so far; the end of the run has another explanation:",
     "constant returns": (
-        "The last {n_evaluations} evaluations of every seed have the same return: the behaviour does not change. If this return "
-        "is not good, the policy is stuck: see docs/how-to/poor-policies.md."
+        "The last {n_evaluations} evaluations of every seed have the same return: what changed in the policy changes no "
+        "episode. If this return is not good, the policy may be stuck: see docs/how-to/poor-policies.md."
     ),
 }
 

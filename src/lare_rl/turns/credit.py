@@ -185,7 +185,7 @@ def _describe_effects(table: TurnTable, prefixes: Prefixes, fit: PrefixFit) -> t
         numbers = {}
         for effect, kinds in EFFECT_KINDS.items():
             row = size * np.isin(prefixes.kind, kinds)
-            numbers[effect] = float(row @ fit.weight)
+            numbers[effect] = float(row @ fit.coefficients)
             numbers[f"{effect}_std"] = float(np.linalg.norm(fit.root[:, :-1] @ row))
         effects.append(FeatureEffect(name=name, feature_size=unit, frequency=float(is_nonzero.mean()), **numbers))
     return tuple(effects)

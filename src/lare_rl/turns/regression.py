@@ -50,6 +50,8 @@ class GroupSums(NamedTuple):
     """sum w (y - y_mean) / y_std in each group."""
     group_weight: Float[np.ndarray, " groups"]
     """W."""
+    total_weight: float
+    """sum w, over all groups. It is also the sum of w y^2 (`Regression.q`), because y has the variance 1."""
     problem: Regression
     """The regression on (v, b). S = sum w (x - x_mean)(x - x_mean)^T is only that of v. p = sum w (x - x_mean) y and then `group_y`."""
 
@@ -58,7 +60,7 @@ class PrefixFit(NamedTuple):
     """The posterior of (v, m, b)."""
 
     x_mean: Float[np.ndarray, " features"]
-    weight: Float[np.ndarray, " features"]
+    coefficients: Float[np.ndarray, " features"]
     """v."""
     mean: float
     """m."""
@@ -104,18 +106,19 @@ def sum_up(
     group_x[group[order][starts]] = np.add.reduceat(weighted[order], starts, axis=0)
     group_y, group_weight = (np.bincount(group, values, n_groups) for values in (scaled, weight))
     alpha_index = np.concatenate([np.arange(x.shape[1]), np.full(n_groups, x.shape[1])])
-    diagonal = np.concatenate([np.diagonal(s), group_weight - group_weight**2 / total])  # of S for v and b
+    # Of S for v and b. That of b is the sum of w (i - W / sum w)^2, where i is 1 in the group and 0 elsewhere.
+    diagonal = np.concatenate([np.diagonal(s), group_weight - group_weight**2 / total])
     problem = Regression(
         s=s,
         p=np.concatenate([scaled @ x_centred, group_y]),
-        q=total,  # the sum of w y^2, because y has the variance 1
+        q=total,
         dof=np.asarray(n_rollouts - 1.0),
         y_mean=y_mean,
         y_std=np.asarray(y_std),
         alpha_index=alpha_index,
         equal_alpha=NUMPY_BACKEND.equal_alpha(diagonal, total, alpha_index),
     )
-    return GroupSums(x_mean=x_mean, group_x=group_x, group_y=group_y, group_weight=group_weight, problem=problem)
+    return GroupSums(x_mean, group_x, group_y, group_weight, total, problem)
 
 
 class _Elimination(NamedTuple):
@@ -124,7 +127,7 @@ class _Elimination(NamedTuple):
     root: Float[np.ndarray, "v_and_m v_and_m"]
     log_det: float
     """log det of the precision of (v, b)."""
-    weight: Float[np.ndarray, " v_and_m"]
+    coefficients: Float[np.ndarray, " v_and_m"]
     """(v, m)."""
     intercept: Float[np.ndarray, " groups"]
     group_row: Float[np.ndarray, "groups v_and_m"]
@@ -142,29 +145,34 @@ def _eliminate_groups(sums: GroupSums, alpha: Float[np.ndarray, " alphas"], beta
     problem, n = sums.problem, len(sums.x_mean)
     d = beta * sums.group_weight + alpha[-1]
     rows = beta * np.column_stack([sums.group_x, sums.group_weight])
-    precision = np.diag(np.append(alpha[:-1], beta * problem.q))
+    precision = np.diag(np.append(alpha[:-1], beta * sums.total_weight))
     precision[:n, :n] += beta * problem.s
     group_row = rows / d[:, None]
     root, log_det = NUMPY_BACKEND.inverse_root(precision - rows.T @ group_row)
-    right = beta * (np.append(problem.p[:n], 0) - group_row.T @ sums.group_y)
-    weight = root.T @ (root @ right)
-    intercept = beta * sums.group_y / d - group_row @ weight
+    right = beta * (np.append(problem.p[:n], 0) - group_row.T @ sums.group_y)  # 0 for m, because y is centred
+    coefficients = root.T @ (root @ right)
+    intercept = beta * sums.group_y / d - group_row @ coefficients
     # The flat prior of m is integrated out: that takes the precision of m itself from the determinant.
-    log_det = log_det + np.log(d).sum() - np.log(beta * problem.q)
+    log_det = log_det + np.log(d).sum() - np.log(beta * sums.total_weight)
     return _Elimination(
-        root=root, log_det=log_det, weight=weight, intercept=intercept, group_row=group_row, group_precision=d
+        root=root,
+        log_det=log_det,
+        coefficients=coefficients,
+        intercept=intercept,
+        group_row=group_row,
+        group_precision=d,
     )
 
 
 def group_moments(sums: GroupSums, alpha: Float[np.ndarray, " alphas"], beta: float) -> Moments:
     """Return the moments of (v, b), as `precisions.dense_moments` of the whole matrix S would."""
     problem, posterior = sums.problem, _eliminate_groups(sums, alpha, beta)
-    v, b = posterior.weight[:-1], posterior.intercept
-    weight = np.concatenate([v, b])
+    v, b = posterior.coefficients[:-1], posterior.intercept
+    v_and_b = np.concatenate([v, b])
     squares = v @ problem.s @ v + 2 * b @ (sums.group_x @ v)
-    squares += sums.group_weight @ b**2 - (sums.group_weight @ b) ** 2 / problem.q
-    residual = problem.q - 2 * weight @ problem.p + squares
-    return Moments(weight, posterior.variance, posterior.log_det, residual)
+    squares += sums.group_weight @ b**2 - (sums.group_weight @ b) ** 2 / sums.total_weight
+    residual = problem.q - 2 * v_and_b @ problem.p + squares
+    return Moments(v_and_b, posterior.variance, posterior.log_det, residual)
 
 
 def fit_linear(
@@ -188,8 +196,8 @@ def fit_linear(
     posterior, unit = _eliminate_groups(sums, alpha, beta), float(problem.y_std)
     return PrefixFit(
         x_mean=sums.x_mean,
-        weight=unit * posterior.weight[:-1],
-        mean=float(problem.y_mean + unit * posterior.weight[-1]),
+        coefficients=unit * posterior.coefficients[:-1],
+        mean=float(problem.y_mean + unit * posterior.coefficients[-1]),
         intercept=unit * posterior.intercept,
         root=unit * posterior.root,
         group_row=posterior.group_row,

@@ -34,7 +34,7 @@ def _predict(
     table: TurnTable, x: Float[np.ndarray, "turns features"], fit: PrefixFit
 ) -> tuple[Float[np.ndarray, " turns"], float]:
     """Return the prediction for each prefix, with the intercept of its rollout's group, and the precision of its outcome."""
-    prediction = fit.mean + (x - fit.x_mean) @ fit.weight + fit.intercept[table.group][table.rollout_index]
+    prediction = fit.mean + (x - fit.x_mean) @ fit.coefficients + fit.intercept[table.group][table.rollout_index]
     return prediction, len(table.length) / len(x) / fit.noise_variance
 
 

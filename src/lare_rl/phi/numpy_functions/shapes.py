@@ -48,6 +48,7 @@ def _register(names: str, convert: Callable[[Any], Any]) -> None:
     numpy_function(*names.split())(apply)
 
 
+# Commas separate functions, spaces the names of one function.
 for _names in (
     "transpose permute_dims,matrix_transpose linalg.matrix_transpose,swapaxes,moveaxis,rollaxis,expand_dims,ravel,broadcast_to,"
     "flip,fliplr,flipud,rot90,diagonal,linalg.diagonal,hsplit,vsplit,dsplit"
@@ -227,7 +228,7 @@ def take(a: Array, indices: Any, axis: Any = None, mode: Any = "raise") -> Any:
     if mode in ("clip", "wrap"):
         size = a.row_shape[at]
         index = FUNCTIONS["clip"](as_array(index), 0, size - 1) if mode == "clip" else as_array(index) % size
-    return +a.select(at, index)
+    return a.select(at, index).copy()
 
 
 def _along_axis(arr: Array, indices: Array, axis: Any) -> tuple[Any, ...]:
