@@ -85,7 +85,7 @@ def test_values_leave_out_the_rollout_itself(problem):
     table, x, fit = problem
     result = values(table, x, fit)
     index = table.rollout_index
-    base = fit.mean + (x - fit.x_mean) @ fit.weight
+    base = fit.mean + (x - fit.x_mean) @ fit.coefficients
     weight = len(table.length) / len(x)
     for k in range(len(table.length)):
         in_group = (table.group[index] == table.group[k]) & (index != k)
