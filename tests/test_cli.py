@@ -40,6 +40,7 @@ def phi(tmp_path):
         ("", ["--help"]),
         ("trian", ["'trian'", "'train'"]),
         ("evaluate a b", ["b", "lare-rl evaluate --help"]),
+        ("train Reacher-v4 --credit.no-start-value", ["write --credit.start-value False"]),
         ("evaluate a --seed 3", ["--seed, 3"]),
         ("train", ["lare-rl train TASK", "--resume DIR"]),
         ("train Reacher-v4 --method magic", ["'magic'", *METHODS]),

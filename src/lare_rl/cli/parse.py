@@ -67,7 +67,13 @@ def parse(
                 raise
             raise LareError(f"{_first_paragraph(stderr.getvalue()).rstrip('.')}; see {prog} --help") from None
     if unknown:
-        hint = did_you_mean(unknown[0], _option_names(commands[name]))
+        names = list(_option_names(commands[name]))
+        # A setting of a table that may be missing is no switch.
+        hint = (
+            f" (write {unknown[0].replace('no-', '', 1)} False)"
+            if unknown[0] in names
+            else did_you_mean(unknown[0], names)
+        )
         raise LareError(f"unrecognized options: {', '.join(unknown)}{hint}; see {prog} --help")
     return command
 
