@@ -187,10 +187,12 @@ def main() -> None:
     print_table(THREE_SEEDS)
     with_gap = {name: comparison for name, comparison in COMPARISONS.items() if has_gap(comparison)}
     rows = {
-        f"{name}\n{comparison.steps:,} steps": {method: estimate_share([comparison], method) for method in METHODS}
+        f"{name}\n{comparison.steps:,} steps": {
+            method: estimate_share([comparison], method) for method in METHODS if method_runs(comparison)[method]
+        }
         for name, comparison in with_gap.items()
     }
-    complete = list(with_gap.values())
+    complete = [comparison for comparison in with_gap.values() if comparison.raw]
     label = f"interquartile mean\nof {len(complete)} tasks, 10 seeds each"
     rows[label] = {method: estimate_share(complete, method) for method in METHODS}
     for name, estimates in rows.items():
@@ -199,6 +201,11 @@ def main() -> None:
     for other in (PAPER, RAW):
         value, low, high = estimate_difference(complete, DEFAULT, other)
         print(f"{DEFAULT} above {other}: {value:.2f} [{low:.2f}, {high:.2f}]")
+    tasks = list(with_gap.values())
+    estimates = {method: estimate_share(tasks, method) for method in (PAPER, DEFAULT)}
+    estimates["difference"] = estimate_difference(tasks, DEFAULT, PAPER)
+    texts = [f"{name} {value:.2f} [{low:.2f}, {high:.2f}]" for name, (value, low, high) in estimates.items()]
+    print(f"all {len(tasks)} tasks: {'; '.join(texts)}")
     means = [f"{method} {np.mean(seed_shares(read_samples(complete, method))):.2f}" for method in METHODS]
     print(f"mean of these tasks: {'; '.join(means)}")
     PICTURE.write_text(draw(rows) + "\n", encoding="utf-8")

@@ -123,6 +123,22 @@ def score_study(sources: str, steps: int, *raw: str, paper: str = "lare-rrdu", w
     )
 
 
+def starcraft(task: str) -> Comparison:
+    """A battle with QMIX. No decoder of raw features was trained."""
+
+    def runs(method: str) -> Sources:
+        return [f"sweeps/headline-starcraft/{task}/{method}"]
+
+    return Comparison(
+        200_000,
+        runs("episodic-qmix"),
+        runs("dense-qmix"),
+        paper=runs("lare-rd-qmix-draw0"),
+        default=runs("lare-bayes-qmix-draw0"),
+        without_phi=runs("bayes-qmix"),
+    )
+
+
 HALF_CHEETAH, WALKER = "HalfCheetah-v4", "Walker2d-v4"
 COMPARISONS = {
     "wheat, SAC": simulator("Wheat", "sac", 6_000),
@@ -143,6 +159,7 @@ COMPARISONS = {
     ),
     "PP-6, IPPO": score_study("scores_published.json:PP-6, late:", 205_000, "rrdu", "lrr", paper="lare-rd"),
     "CN-6, IPPO": score_study("scores_published.json:CN-6, late:", 205_000, "rrdu", "lrr", paper="lare-rd"),
+    "SMAX-2s3z, QMIX": starcraft("SMAX-2s3z"),
 }
 """Ten seeds for each method."""
 
