@@ -183,7 +183,7 @@ def test_random_actions_play_the_same_groups(small, tmp_path, command):
     lines = list(
         describe_evaluation(by_turns, evaluate_policy(by_turns, 3), play_random(by_turns.config.task, 3), None)
     )
-    assert lines[-1].startswith("random actions played other groups (level)")
+    assert lines[-1].startswith("random actions did not play the same groups (level)")
 
 
 def test_evaluate_in_another_environment(run, command):
