@@ -2,11 +2,13 @@
 
 import jax
 import numpy as np
+import pytest
 
 from helpers.jax_families import check_arrays, family_task, play, require_family
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import Team
 from lare_rl.envs.jaxmarl_env import make
+from lare_rl.errors import LareError
 
 require_family("jaxmarl")
 
@@ -18,11 +20,13 @@ def tag_team(name: str):
 
 
 def test_teams_and_padding():
-    env = make_env(family_task(TAG, 20, 5, teams=[tag_team("agent"), tag_team("adversary")]))
-    assert env.spec.teams == (Team("agent", 0, 1), Team("adversary", 1, 4))
+    with pytest.raises(LareError, match="List the teams in the order"):  # the agents' indices are entries
+        make_env(family_task(TAG, 20, 5, teams=[tag_team("agent"), tag_team("adversary")]))
+    env = make_env(family_task(TAG, 20, 5, teams=[tag_team("adversary"), tag_team("agent")]))
+    assert env.spec.teams == (Team("adversary", 0, 3), Team("agent", 3, 4))
     _, timestep = jax.jit(env.reset)(jax.random.key(0))
     np.testing.assert_array_equal(timestep.observation[:, 16:], np.eye(4))
-    assert not timestep.observation[0, 14:16].any()  # the good agent observes less
+    assert not timestep.observation[3, 14:16].any()  # the good agent observes less
     assert env.spec.state_size == 0
     assert make(tag_team("agent").model_copy(update={"credit_scope": "state"})).spec.state_size == 80
 
