@@ -24,8 +24,7 @@ def evaluate(
 
     Prints the mean return of the policy and of random actions, with their standard deviations, and the difference with its standard
     error. Random actions are played for as many episodes, but at least ten; fewer where they are slow. In an environment in Python they
-    start
-    from the same initial states. A policy that samples its actions also plays the most likely ones.
+    start from the same initial states. A policy that samples its actions also plays the most likely ones.
 
     Args:
         run: a run directory.

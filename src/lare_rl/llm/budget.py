@@ -35,7 +35,7 @@ class Budget:
     """Whether more tokens may be counted than were used, because a server did not report them."""
 
     def max_reply_tokens(self, messages: Sequence[Message], min_tokens: int) -> int:
-        """Return how many tokens the reply to a request may have: what is left after the request, each byte of which counts as a token.
+        """Return how many tokens the reply to a request may have: those that are left, less the bytes of the request.
 
         Raises:
             BudgetExceededError: no request or time is left, or fewer than `min_tokens` tokens.

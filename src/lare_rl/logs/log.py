@@ -22,7 +22,7 @@ _Item = TypeVar("_Item")
 BATCH_STEPS = 8192
 """Steps at a time: at least this many are computed or written, and at most this many rows of steps are read."""
 ABANDONED_S = 3600.0
-"""Incomplete output that was not changed for this time (s) is what a killed process has left."""
+"""If incomplete output was not changed for this time (s), its process was killed."""
 LOG_SUFFIXES = frozenset({".npz", ".parquet", ".arrow", ".json"})
 """Files of logs. A directory with other files is never replaced."""
 
@@ -140,7 +140,7 @@ def atomic_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> I
 
 
 def _clean_up(out: Path) -> None:
-    """Put back the data that a killed process had moved away, and remove what it wrote, if it is an hour old: others may be writing."""
+    """Put back the data that a killed process had moved away. Remove its incomplete output, but not that of a living process."""
     with contextlib.suppress(OSError):
         for path in out.parent.glob(f".{glob.escape(out.name)}.{'[0-9a-f]' * 32}.*"):  # not those of `OUT.b`
             if path.suffix == ".old" and not out.exists():

@@ -136,7 +136,7 @@ class Iterator(list):
     """The result of zip, map, a generator and the like. Its entries can be read once."""
 
     def read(self) -> Iterable[Any]:
-        """Yield the entries. Those that are not read stay."""
+        """Yield the entries one by one, and remove each. If the caller stops, the other entries stay."""
         while self:
             yield self.pop(0)
 

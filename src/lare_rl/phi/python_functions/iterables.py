@@ -45,7 +45,7 @@ def sum_(runtime: Runtime, values: Any, start: Any = 0) -> Any:
 
 
 def _unordered(runtime: Runtime, values: Any) -> Sequence[Any]:
-    """Return entries of which the order does not matter."""
+    """Return the entries for a function whose result is the same in every order."""
     return list(values) if isinstance(values, Set) else runtime.items(values)
 
 
