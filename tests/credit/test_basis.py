@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from lare_rl.credit.basis import MAX_FEATURES, MAX_PAIRED_RAW_FEATURES, Basis, expand, fourier_terms
+from lare_rl.credit.linear_decoder import init
 
 U = np.array([0.5, -1.0, 2.0, 9.0, -0.3], np.float32)
 """Three factors and two raw features. The first raw feature is far from its mean."""
@@ -50,3 +51,16 @@ def test_many_raw_features_have_fewer_frequencies_and_no_pairs(n_raw, frequencie
     assert basis.n_features == n_raw * (1 + 2 * frequencies) + n_pairs
     assert basis.n_features <= max(MAX_FEATURES, n_raw)
     assert Basis(20, 50, extended=True).raw_frequencies == 1  # factors leave less room
+
+
+@pytest.mark.parametrize("sizes", [(3, 2, 0), (3, 13, 3), (0, 4, 4), (2, 0, 2)])
+def test_reads_input_names_the_inputs_whose_change_matters(sizes):
+    basis = Basis(sizes[0], sizes[1], extended=True, n_tracked=sizes[2])
+    rng, size, features = np.random.default_rng(0), basis.n_standardised, init(basis, 1).features
+    rows = rng.normal(size=(100, basis.n_inputs)).astype(np.float32)
+    for i in range(size):
+        changed = [i, *(size + i + basis.n_tracked * np.arange(3))] if i < basis.n_tracked else [i]
+        other_rows = rows.copy()
+        other_rows[:, changed] = rng.normal(size=(100, len(changed)))
+        differs = np.any(features(jnp.asarray(other_rows)) != features(jnp.asarray(rows)), axis=0)
+        np.testing.assert_array_equal(differs, basis.reads_input[:, i])

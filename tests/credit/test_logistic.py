@@ -7,6 +7,7 @@ from lare_rl.util.float64 import float64
 
 GROUP_INDEX = np.array([0, 0, 0, 1, 1, 1, 1, 1])
 ROUNDS = 60
+ALL = jnp.ones(len(GROUP_INDEX), bool)
 
 
 def make_episodes(n_episodes, seed=0, scale=1.0):
@@ -21,7 +22,7 @@ def fit(x, returns, rounds=ROUNDS):
     state = logistic.init(GROUP_INDEX)
     with float64():
         state = logistic.add_episodes(state, jnp.asarray(x), jnp.asarray(returns), jnp.ones(len(x), bool))
-        return logistic.fit(state, GROUP_INDEX, rounds)
+        return logistic.fit(state, GROUP_INDEX, ALL, rounds)
 
 
 def slow_fit(x, won, rounds):
@@ -108,7 +109,7 @@ def test_a_window_of_wins_keeps_the_fit():
     wins, _, _ = make_episodes(logistic.WINDOW, seed=1)
     with float64():
         won = logistic.add_episodes(state, jnp.asarray(wins), jnp.full(len(wins), 10.0), jnp.ones(len(wins), bool))
-        won = logistic.fit(won, GROUP_INDEX, ROUNDS)
+        won = logistic.fit(won, GROUP_INDEX, ALL, ROUNDS)
     np.testing.assert_array_equal(won.posterior.weight, state.posterior.weight)
     assert logistic.to_returns(won)[1] > 0.5 * logistic.to_returns(state)[1] > 0
     assert 0 < float(logistic.predict(won, jnp.asarray(wins[:1]))[0]) < 10

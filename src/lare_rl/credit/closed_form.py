@@ -40,15 +40,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lare_rl.credit import evidence, linear_decoder, logistic, relevance
+from lare_rl.credit import evidence, linear_decoder, logistic, relevance, terminal
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.evidence import SufficientStatistics
+from lare_rl.credit.evidence import PosteriorCovariance, SufficientStatistics
 from lare_rl.credit.linear_decoder import LinearDecoder
 from lare_rl.credit.logistic import LogOddsFit
 from lare_rl.credit.precisions import Posterior
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.nn.leading_axis import map_leading_axis
-from lare_rl.nn.normalise import RunningMeanStd, running_std
+from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, running_std
 
 __all__ = [
     "ClosedForm",
@@ -83,6 +83,8 @@ class ClosedForm(NamedTuple):
     """Each number is held as two float32 numbers (`split_double`)."""
     n_steps: Float[Array, ""]
     """The number of rows (one for each agent and step) that mean and std were computed from."""
+    before_end: RunningMeanStd
+    """Of the inputs, over all steps in the sums but the last step of each episode (`terminal.py`)."""
     n_fitted: Float[Array, ""]
     """The number of episodes that the decoder is fitted to."""
     posterior: Posterior
@@ -110,6 +112,7 @@ def init(basis: Basis, score_types: tuple[int, ...]) -> ClosedForm:
         decoder=linear_decoder.init(basis, n_score_types),
         sufficient_statistics=split_double(evidence.empty_statistics(basis.n_columns)),
         n_steps=jnp.zeros(()),
+        before_end=empty_mean_std(basis.n_standardised),
         n_fitted=jnp.zeros(()),
         posterior=posterior,
         strengths=strengths,
@@ -149,6 +152,7 @@ def reset_statistics(state: ClosedForm, inputs: RunningMeanStd) -> ClosedForm:
         decoder=eqx.tree_at(lambda d: (d.mean, d.std), state.decoder, (inputs.mean, running_std(inputs))),
         sufficient_statistics=jax.tree.map(jnp.zeros_like, state.sufficient_statistics),
         n_steps=inputs.n_rows,
+        before_end=jax.tree.map(jnp.zeros_like, state.before_end),
         n_fitted=jnp.zeros_like(state.n_fitted),
         log_odds=None if state.log_odds is None else logistic.remove_episodes(state.log_odds),
     )
@@ -182,14 +186,17 @@ def fit(
     average and `fixed_length` (all episodes have the same length) is false, no step is paid for the mean return.
     """
     basis = state.decoder.basis
-    groups, strengths = _fit_linear_types(state, score_types, max_rounds, vectorized=vectorized)
-    weights = _linear_weights(basis, groups, strengths, _start_value_unit(state))
+    linear_types = tuple(score_type for score_type in score_types if score_type != ScoreType.LOG_ODDS)
+    groups, strengths = _fit_linear_types(state, linear_types, max_rounds, vectorized=vectorized)
+    best = relevance.select(strengths, groups, basis.column_group_index, basis.column_strength_index)
+    best = _add_terminal(state, linear_types, best, max_rounds, vectorized=vectorized)
+    weights = _linear_weights(basis, best, _start_value_unit(state))
     if ScoreType.AVERAGE in score_types and not fixed_length:
         weights = _centre_average(state, weights, score_types.index(ScoreType.AVERAGE))
     posterior, strengths = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (groups, strengths))
     state = state._replace(posterior=posterior, strengths=strengths)
     if state.log_odds is not None:
-        log_odds = logistic.fit(state.log_odds, basis.column_group_index, max_rounds)
+        log_odds = logistic.fit(state.log_odds, basis.column_group_index, ~_terminal_columns(state), max_rounds)
         state = state._replace(log_odds=log_odds)
         start_value, slope = logistic.to_returns(log_odds)
         log_odds_weights = _Weights(slope * log_odds.posterior.weight[None], jnp.zeros(1), start_value[None])
@@ -200,18 +207,40 @@ def fit(
 def _fit_linear_types(
     state: ClosedForm, score_types: tuple[int, ...], max_rounds: int, *, vectorized: bool
 ) -> tuple[Posterior, Posterior]:
-    """Return the fits by groups and by strengths of all score types but log odds, along a leading axis."""
-    linear_types = [score_type for score_type in score_types if score_type != ScoreType.LOG_ODDS]
+    """Return the fits by groups and by strengths of sum and average, along a leading axis."""
     indices = state.decoder.basis.column_group_index, state.decoder.basis.column_strength_index
 
     def fit_score_type(args: tuple[Int[Array, ""], Posterior, Posterior]) -> tuple[Posterior, Posterior]:
         score_type, *earlier = args
         groups, strengths = jax.tree.map(lambda leaf: leaf.astype(float), earlier)
-        statistics = _score_type_statistics(state, score_type)
+        statistics = terminal.keep_columns(_score_type_statistics(state, score_type), ~_terminal_columns(state))
         return relevance.fit(statistics, score_type, *indices, groups, strengths, max_rounds, vectorized=vectorized)
 
-    rows = jnp.asarray(linear_types), state.posterior, state.strengths
+    rows = jnp.asarray(score_types), state.posterior, state.strengths
     return map_leading_axis(fit_score_type, rows, vectorized=vectorized)
+
+
+def _terminal_columns(state: ClosedForm) -> Bool[Array, " columns"]:
+    decoder = state.decoder
+    return terminal.terminal_columns(decoder.basis, terminal.is_terminal(state.before_end, decoder.std))
+
+
+def _add_terminal(
+    state: ClosedForm, score_types: tuple[int, ...], posterior: Posterior, max_rounds: int, *, vectorized: bool
+) -> Posterior:
+    """Return the fits with the weights of terminal inputs, which are 0 before."""
+    columns, alpha_index = _terminal_columns(state), state.decoder.basis.column_group_index
+
+    def fit_score_type(args: tuple[Int[Array, ""], Posterior]) -> Posterior:
+        score_type, first = args
+        statistics = _score_type_statistics(state, score_type)
+        second = terminal.fit_residual(statistics, score_type, alpha_index, first.weight, columns, max_rounds)
+        return first._replace(weight=jnp.where(columns, second.weight, first.weight), bias=second.bias)
+
+    def fit_score_types(posterior: Posterior) -> Posterior:
+        return map_leading_axis(fit_score_type, (jnp.asarray(score_types), posterior), vectorized=vectorized)
+
+    return jax.lax.cond(jnp.any(columns), fit_score_types, lambda unchanged: unchanged, posterior)
 
 
 def _score_type_statistics(state: ClosedForm, score_type: Int[Array, ""] | int) -> SufficientStatistics:
@@ -223,9 +252,9 @@ def _score_type_statistics(state: ClosedForm, score_type: Int[Array, ""] | int) 
     if not basis.start_value:
         return statistics
     unit = jnp.ones(len(statistics.mean)).at[basis.n_features].set(_start_value_unit(state))
-    is_used = (np.arange(len(unit)) != basis.n_features) | (score_type == ScoreType.SUM)
-    products = jnp.where(jnp.outer(is_used, is_used), statistics.products * jnp.outer(unit, unit), 0)
-    return statistics._replace(mean=statistics.mean * unit, products=products)
+    is_used = (np.arange(basis.n_columns) != basis.n_features) | (score_type == ScoreType.SUM)
+    scaled = statistics._replace(mean=statistics.mean * unit, products=statistics.products * jnp.outer(unit, unit))
+    return terminal.keep_columns(scaled, is_used)
 
 
 def _start_value_unit(state: ClosedForm) -> Float[Array, ""]:
@@ -234,10 +263,7 @@ def _start_value_unit(state: ClosedForm) -> Float[Array, ""]:
     return 1 / jnp.where(mean > 0, mean, 1)
 
 
-def _linear_weights(
-    basis: Basis, groups: Posterior, strengths: Posterior, start_value_unit: Float[Array, ""]
-) -> _Weights:
-    best = relevance.select(strengths, groups, basis.column_group_index, basis.column_strength_index)
+def _linear_weights(basis: Basis, best: Posterior, start_value_unit: Float[Array, ""]) -> _Weights:
     if basis.prefixes:
         return _Weights(best.weight, best.weight[:, basis.n_features], best.bias)
     start_value = jnp.zeros_like(best.bias)
@@ -279,14 +305,15 @@ def reward_std(
 ) -> Float[Array, " rows"]:
     """Return the posterior standard deviation of r_hat, or of T r_hat if the score is an average.
 
-    Only after `fit`, not after `fit_signs`. `index` is the position of the score type among all that are fitted.
+    The uncertainty about what terminal inputs are paid is left out. Only after `fit`, not after `fit_signs`. `index` is the position of the
+    score type among all that are fitted.
     """
     basis, features, n_linear = state.decoder.basis, state.decoder.features(rows), len(state.posterior.bias)
     linear_index = jnp.minimum(index, n_linear - 1)
     best = relevance.select(state.strengths, state.posterior, basis.column_group_index, basis.column_strength_index)
-    score_type = jnp.asarray(score_types)[linear_index]
+    score_type, columns = jnp.asarray(score_types)[linear_index], _terminal_columns(state)
     covariance = evidence.posterior_covariance(
-        _score_type_statistics(state, score_type),
+        terminal.keep_columns(_score_type_statistics(state, score_type), ~columns),
         score_type,
         basis.column_strength_index,
         jax.tree.map(lambda leaf: leaf[linear_index].astype(float), best),
@@ -294,11 +321,15 @@ def reward_std(
     if basis.prefixes:  # a step adds 1 to the number of steps, and V_0 is no part of its reward
         features = jnp.append(features, jnp.ones((*features.shape[:-1], 1)), axis=-1)
         covariance = covariance._replace(centre=jnp.zeros_like(covariance.centre), centre_variance=jnp.zeros(()))
-    std = evidence.posterior_std(covariance, features)
+    std = evidence.posterior_std(_leave_out(covariance, columns), features)
     if state.log_odds is None:
         return std
-    log_odds_std = evidence.posterior_std(logistic.covariance(state.log_odds), features)
+    log_odds_std = evidence.posterior_std(_leave_out(logistic.covariance(state.log_odds), columns), features)
     return jnp.where(index == n_linear, log_odds_std, std)
+
+
+def _leave_out(covariance: PosteriorCovariance, columns: Bool[Array, " columns"]) -> PosteriorCovariance:
+    return covariance._replace(root=jnp.where(columns, 0, covariance.root))
 
 
 def fit_signs(state: ClosedForm) -> ClosedForm:

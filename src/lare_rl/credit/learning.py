@@ -27,6 +27,8 @@ from lare_rl.credit.methods import Fit
 from lare_rl.credit.prequential import RETURN_TOLERANCE, Predictions, add_predictions
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate, compare_score_types, is_better, score_type_errors
 from lare_rl.credit.spec import CreditSpec
+from lare_rl.nn import normalise
+from lare_rl.nn.normalise import RunningMeanStd
 
 __all__ = [
     "MIN_GROWTH",
@@ -174,7 +176,20 @@ def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     else:
         columns = _columns(closed.decoder, episodes)
         statistics = evidence.add_episodes(statistics, columns, returns, jnp.where(mask, episodes.length, 0))
-    return add_to_log_odds(closed._replace(sufficient_statistics=closed_form.split_double(statistics)), episodes)
+    closed = closed._replace(
+        sufficient_statistics=closed_form.split_double(statistics),
+        before_end=_add_before_end(closed.before_end, episodes),
+    )
+    return add_to_log_odds(closed, episodes)
+
+
+def _add_before_end(before_end: RunningMeanStd, episodes: CreditBatch) -> RunningMeanStd:
+    """Add all steps of some episodes but the last one of each."""
+    n_inputs, index = len(before_end.mean), episodes.episode_index
+    is_last = jnp.append(index[1:] != index[:-1], True)
+    valid = decoder_state.valid_rows(episodes)
+    mask = valid & ~is_last.reshape(-1, *[1] * (valid.ndim - 1))
+    return normalise.update_mean_std(before_end, episodes.inputs[..., :n_inputs].reshape(-1, n_inputs), mask.ravel())
 
 
 def add_to_log_odds(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:

@@ -113,8 +113,15 @@ _State = tuple[Int[Array, ""], Float[Array, ""], Float[Array, " window"], Poster
 """The number of rounds so far, the largest change of xi in the last of them, xi, and the fit."""
 
 
-def fit(state: LogOddsFit, alpha_index: AlphaIndex, max_rounds: int | Int[Array, ""]) -> LogOddsFit:
+def fit(
+    state: LogOddsFit,
+    alpha_index: AlphaIndex,
+    is_kept: Bool[Array, " columns"],
+    max_rounds: int | Int[Array, ""],
+) -> LogOddsFit:
     """Fit to the episodes, from the precisions of the last fit. Call this with float64 enabled.
+
+    Only columns where `is_kept` is true have weights that are not 0.
 
     Returns are divided into won and lost halfway between the lowest and the highest. While all episodes are won, or all are lost, or all
     returns are equal but for rounding errors, nothing changes.
@@ -128,6 +135,7 @@ def fit(state: LogOddsFit, alpha_index: AlphaIndex, max_rounds: int | Int[Array,
     squares = jnp.sum(jnp.where(valid[:, None], x - jnp.sum(x, axis=0) / n_episodes, 0) ** 2, axis=0)
     # The rounding errors of sums that cancel are as large as those of other sums: one size serves for all columns.
     is_used = varies(squares / n_episodes, jnp.sum(x**2) / (n_episodes * x.shape[1]))
+    is_used &= is_kept
     x = jnp.where(is_used, x, 0)
     # By this alpha, all groups together change the log odds of an episode by about 1.
     equal_alpha = JAX_BACKEND.equal_alpha(jnp.where(is_used, squares, 0), 2 * n_episodes, alpha_index)

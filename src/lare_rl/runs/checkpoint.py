@@ -37,7 +37,7 @@ REPLAY = ".replay."
 SAVED_BY_ROW = f"{REPLAY}columns"
 """The path of the arrays that are saved by row."""
 ZERO_IF_MISSING = (
-    *(".closed_form.strengths.", ".closed_form.intercept", ".closed_form.start_value"),
+    *(".closed_form.strengths.", ".closed_form.intercept", ".closed_form.start_value", ".closed_form.before_end."),
     ".target_scale",
     *(".log_odds.lowest", ".log_odds.highest"),
     *(".is_log_odds", ".is_average", ".predictions.level", ".score_type_predictions.level"),

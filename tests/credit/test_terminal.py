@@ -1,0 +1,103 @@
+"""Episodes in which each step has a cause, and the last one says what came of all causes: the outcome."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers.credit_specs import observation_spec
+from lare_rl.credit import closed_form, decoder_state, learning, terminal
+from lare_rl.credit.basis import Basis
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_state import CreditBatch
+from lare_rl.credit.methods import METHODS
+from lare_rl.nn.normalise import RunningMeanStd
+from lare_rl.util.float64 import float64
+
+CAUSE, OUTCOME, CONSTANT = range(3)
+N_EPISODES = 300
+
+
+def sample(lengths, seed=0):
+    """Return the rows of episodes, and their returns: R = 3 causes + noise, and the outcome is R."""
+    rng, ends = np.random.default_rng(seed), np.cumsum(lengths) - 1
+    rows = np.zeros((lengths.sum(), 1, 3), np.float32)
+    rows[:, 0, CAUSE], rows[:, 0, CONSTANT] = rng.normal(size=len(rows)), 2.0
+    returns = 3 * np.add.reduceat(rows[:, 0, CAUSE], ends + 1 - lengths) + 3 * rng.normal(size=len(lengths))
+    rows[ends, 0, OUTCOME] = returns
+    return rows, returns
+
+
+def fit(lengths, method="rd-linear", score="sum"):
+    """Return the state after a fit to sampled episodes, their mean features, and R/T."""
+    rows, returns = sample(lengths)
+    if score == "binary":
+        returns = np.sign(returns)
+    spec = observation_spec(3, METHODS[method], CreditSettings(score=score), int(lengths.max()), fixed_length=False)
+    batch = CreditBatch(
+        inputs=jnp.asarray(rows),
+        episode_index=jnp.repeat(jnp.arange(len(lengths)), lengths),
+        length=jnp.asarray(lengths),
+        mean_reward=jnp.asarray(returns / lengths),
+        mask=jnp.ones(len(lengths)),
+    )
+    state = decoder_state.init(jax.random.key(0), spec)
+    state = decoder_state.observe_steps(state, batch.inputs)
+    with float64():
+        closed = learning.add_to_sums(closed_form.reset_statistics(state.closed_form, state.statistics), batch)
+        state = jax.jit(learning.fit_closed_form, static_argnums=1)(state._replace(closed_form=closed), spec)
+        means = np.asarray(learning.mean_features(state.closed_form.decoder, batch))
+    return state, means, returns / lengths
+
+
+def test_fit_pays_a_terminal_input_what_all_others_leave():
+    """Two regressions, each by ordinary least squares with the weights T, as there are many episodes."""
+    lengths = np.random.default_rng(1).integers(2, 8, N_EPISODES)
+    state, means, y = fit(lengths)
+    weight = np.asarray(state.network.weight)
+    first = np.stack([np.ones(N_EPISODES), means[:, CAUSE], 1 / lengths], axis=1) * np.sqrt(lengths)[:, None]
+    solution = np.linalg.lstsq(first, y * np.sqrt(lengths))[0]
+    residual = y - first @ solution / np.sqrt(lengths)
+    second = np.stack([np.ones(N_EPISODES), means[:, OUTCOME]], axis=1) * np.sqrt(lengths)[:, None]
+    _, slope = np.linalg.lstsq(second, residual * np.sqrt(lengths))[0]
+    assert weight[CAUSE] == pytest.approx(solution[1], rel=0.01)
+    assert weight[OUTCOME] == pytest.approx(slope, rel=0.1)
+    assert weight[CONSTANT] == 0
+    assert weight[CAUSE] / state.network.std[CAUSE] == pytest.approx(3, rel=0.1)
+
+
+def test_fit_in_episodes_of_one_step_knows_no_end():
+    state, _, _ = fit(np.ones(N_EPISODES, int))
+    weight = np.asarray(state.network.weight) / np.where(state.network.std > 0, state.network.std, 1)
+    np.testing.assert_allclose(weight, [0, 1, 0], atol=0.01)
+
+
+def test_fit_of_log_odds_ignores_terminal_inputs():
+    state, _, _ = fit(np.random.default_rng(1).integers(2, 8, N_EPISODES), "bayes", "binary")
+    closed = state.closed_form
+    columns = np.asarray(terminal.terminal_columns(closed.decoder.basis, jnp.arange(3) == OUTCOME))
+    weight = np.asarray(closed.log_odds.posterior.weight)
+    assert not weight[columns].any()
+    assert weight[~columns].any()
+
+
+def test_reward_std_leaves_terminal_inputs_out():
+    state, _, _ = fit(np.random.default_rng(1).integers(2, 8, N_EPISODES))
+    rows = jnp.asarray([[1.0, 0.0, 2.0], [1.0, 9.0, 2.0]])
+    with float64():
+        std = np.asarray(closed_form.reward_std(state.closed_form, rows, (0, 1), 0))
+    assert 0 < std[0] == std[1]
+
+
+@pytest.mark.parametrize(
+    ("n_rows", "sum_squares", "std", "want"), [(9, 0, 1, True), (9, 1, 1, False), (9, 0, 0, False), (0, 0, 1, False)]
+)
+def test_is_terminal(n_rows, sum_squares, std, want):
+    before_end = RunningMeanStd(jnp.float32(n_rows), jnp.ones(1), jnp.float32([sum_squares]))
+    assert bool(terminal.is_terminal(before_end, jnp.float32([std]))[0]) == want
+
+
+def test_no_column_of_prefixes_is_terminal():
+    for prefixes in (False, True):
+        basis = Basis(1, 1, extended=True, prefixes=prefixes)
+        assert bool(terminal.terminal_columns(basis, jnp.ones(2, bool)).any()) is not prefixes
