@@ -228,8 +228,14 @@ def _terminal_columns(state: ClosedForm) -> Bool[Array, " columns"]:
 def _add_terminal(
     state: ClosedForm, score_types: tuple[int, ...], posterior: Posterior, max_rounds: int, *, vectorized: bool
 ) -> Posterior:
-    """Return the fits with the weights of terminal inputs, which are 0 before."""
-    columns, alpha_index = _terminal_columns(state), state.decoder.basis.column_group_index
+    """Return the fits with the weights of terminal inputs, which are 0 before. The start value is fitted again with them.
+
+    A terminal input that is the same in all episodes, such as the fall that ends each of them, has the mean 1/T.
+    """
+    basis, columns = state.decoder.basis, _terminal_columns(state)
+    has_terminal, alpha_index = jnp.any(columns), basis.column_group_index
+    if basis.start_value:
+        columns = columns.at[basis.n_features].set(True)
 
     def fit_score_type(args: tuple[Int[Array, ""], Posterior]) -> Posterior:
         score_type, first = args
@@ -240,7 +246,7 @@ def _add_terminal(
     def fit_score_types(posterior: Posterior) -> Posterior:
         return map_leading_axis(fit_score_type, (jnp.asarray(score_types), posterior), vectorized=vectorized)
 
-    return jax.lax.cond(jnp.any(columns), fit_score_types, lambda unchanged: unchanged, posterior)
+    return jax.lax.cond(has_terminal, fit_score_types, lambda unchanged: unchanged, posterior)
 
 
 def _score_type_statistics(state: ClosedForm, score_type: Int[Array, ""] | int) -> SufficientStatistics:

@@ -55,7 +55,7 @@ def fit_residual(
     columns: Bool[Array, " columns"],
     max_rounds: int,
 ) -> Posterior:
-    """Fit what a fit with some weights leaves unexplained to the terminal columns.
+    """Fit some columns to what the other columns leave unexplained by their weights of an earlier fit.
 
     The bias of the result is that of both fits together.
     """
