@@ -125,6 +125,21 @@ def test_a_factor_of_equal_means_varies_by_its_shapes():
     assert result.factor_shares[0] > 0.9
 
 
+def test_a_terminal_factor_explains_what_others_leave():
+    """The second factor is the return, at the last step of each episode. The first one causes it, up to noise."""
+    u, length = sample_inputs(120, 2)
+    ends = np.cumsum(length) - 1
+    returns = np.add.reduceat(u[:, 0], ends + 1 - length) + 5 * np.random.default_rng(1).normal(size=len(length))
+    u[:, 1], reward = 0, np.zeros(len(u))
+    u[ends, 1] = reward[ends] = returns
+    result = explain_rewards(EXTENDED, u, length, reward)
+    assert result.terminal.tolist() == [False, True]
+    assert result.factor_shares[0] > 0.7
+    assert result.factor_shares[1] > 0.02
+    assert float(result.factors_r2) == pytest.approx(result.factor_shares.sum())
+    assert 0.9 < result.slope[0] < 1.1
+
+
 def test_sum_of_shares_few_episodes_and_equal_factors():
     for noise in (0.1, 3.0):
         result = explain_function(EXTENDED, [2.0, -1.0, 0.5, 1.0, 0], count=30, noise=noise)

@@ -34,6 +34,7 @@ def explanation(**changes):
         "slope_covariance": np.diag([0.01, 0.01]),
         "linear_share": np.array([0.81, 1.0]),
         "std": np.array([2.0, 0.5]),
+        "terminal": np.array([False, False]),
         "same_as": np.array([-1, -1]),
         "residual_correlation": np.array([0.1, -0.8]),
     }
@@ -133,6 +134,7 @@ def test_unclear_effects(std, linear_share, code):
         ({"linear_share": np.array([0.79, 0.1]), "factor_shares": np.array([0.95, 0.04])}, ["is_curved", None]),
         ({"linear_share": np.zeros(2), "pair_shares": np.array([0.13, 0.3])}, ["is_curved", "depends_on_factor"]),
         ({"same_as": np.array([1, 0])}, ["same_as", "same_as"]),
+        ({"terminal": np.array([True, False])}, [None, "terminal"]),
     ],
 )
 def test_shapes_of_effects(changes, shapes):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.credit_specs import observation_spec
-from lare_rl.credit import closed_form, decoder_state, learning, terminal
+from lare_rl.credit import closed_form, decoder_state, evidence, learning, terminal
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoder_state import CreditBatch
@@ -75,29 +75,38 @@ def test_fit_in_episodes_of_one_step_knows_no_end():
 def test_fit_of_log_odds_ignores_terminal_inputs():
     state, _, _ = fit(np.random.default_rng(1).integers(2, 8, N_EPISODES), "bayes", "binary")
     closed = state.closed_form
-    columns = np.asarray(terminal.terminal_columns(closed.decoder.basis, jnp.arange(3) == OUTCOME))
+    statistics = closed_form.to_float64(closed.sufficient_statistics)
+    columns = np.asarray(terminal.terminal_columns(closed.decoder.basis, statistics, closed.before_end))
     weight = np.asarray(closed.log_odds.posterior.weight)
     assert not weight[columns].any()
     assert weight[~columns].any()
 
 
-def test_reward_std_leaves_terminal_inputs_out():
+def test_reward_std_counts_terminal_inputs():
     state, _, _ = fit(np.random.default_rng(1).integers(2, 8, N_EPISODES))
     rows = jnp.asarray([[1.0, 0.0, 2.0], [1.0, 9.0, 2.0]])
     with float64():
         std = np.asarray(closed_form.reward_std(state.closed_form, rows, (0, 1), 0))
-    assert 0 < std[0] == std[1]
+    assert 0 < std[0] < std[1] < 1
 
 
 @pytest.mark.parametrize(
-    ("n_rows", "sum_squares", "std", "want"), [(9, 0, 1, True), (9, 1, 1, False), (9, 0, 0, False), (0, 0, 1, False)]
+    ("n_rows", "spread", "prefixes", "want"),
+    [
+        (9, [0, 1], False, [True, False, True, True]),
+        (9, [1, 1], False, [False] * 4),
+        (0, [0, 0], False, [False] * 4),
+        (9, [0, 1], True, [False] * 4),
+    ],
 )
-def test_is_terminal(n_rows, sum_squares, std, want):
-    before_end = RunningMeanStd(jnp.float32(n_rows), jnp.ones(1), jnp.float32([sum_squares]))
-    assert bool(terminal.is_terminal(before_end, jnp.float32([std]))[0]) == want
-
-
-def test_no_column_of_prefixes_is_terminal():
-    for prefixes in (False, True):
-        basis = Basis(1, 1, extended=True, prefixes=prefixes)
-        assert bool(terminal.terminal_columns(basis, jnp.ones(2, bool)).any()) is not prefixes
+def test_terminal_columns(n_rows, spread, prefixes, want):
+    """The columns of two factors, the first cosine of the first one, and their pair. Those of the second sine do not vary."""
+    basis = Basis(2, 0, extended=True, prefixes=prefixes)
+    before_end = RunningMeanStd(jnp.float32(n_rows), jnp.ones(2), jnp.float32(spread))
+    variation = np.ones(basis.n_columns + 2)
+    variation[5] = 0
+    statistics = evidence.empty_statistics(basis.n_columns)
+    statistics = statistics._replace(n_steps=jnp.float32(n_rows), products=jnp.diag(jnp.asarray(variation)))
+    columns = np.asarray(terminal.terminal_columns(basis, statistics, before_end))
+    assert columns[[0, 1, 2, basis.n_features - 1]].tolist() == want
+    assert not columns[5]

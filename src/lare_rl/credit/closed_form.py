@@ -42,7 +42,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import evidence, linear_decoder, logistic, relevance, terminal
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.evidence import PosteriorCovariance, SufficientStatistics
+from lare_rl.credit.evidence import SufficientStatistics
 from lare_rl.credit.linear_decoder import LinearDecoder
 from lare_rl.credit.logistic import LogOddsFit
 from lare_rl.credit.precisions import Posterior
@@ -221,8 +221,8 @@ def _fit_linear_types(
 
 
 def _terminal_columns(state: ClosedForm) -> Bool[Array, " columns"]:
-    decoder = state.decoder
-    return terminal.terminal_columns(decoder.basis, terminal.is_terminal(state.before_end, decoder.std))
+    statistics = to_float64(state.sufficient_statistics)
+    return terminal.terminal_columns(state.decoder.basis, statistics, state.before_end)
 
 
 def _add_terminal(
@@ -311,15 +311,14 @@ def reward_std(
 ) -> Float[Array, " rows"]:
     """Return the posterior standard deviation of r_hat, or of T r_hat if the score is an average.
 
-    The uncertainty about what terminal inputs are paid is left out. Only after `fit`, not after `fit_signs`. `index` is the position of the
-    score type among all that are fitted.
+    Only after `fit`, not after `fit_signs`. `index` is the position of the score type among all that are fitted.
     """
     basis, features, n_linear = state.decoder.basis, state.decoder.features(rows), len(state.posterior.bias)
     linear_index = jnp.minimum(index, n_linear - 1)
     best = relevance.select(state.strengths, state.posterior, basis.column_group_index, basis.column_strength_index)
     score_type, columns = jnp.asarray(score_types)[linear_index], _terminal_columns(state)
     covariance = evidence.posterior_covariance(
-        terminal.keep_columns(_score_type_statistics(state, score_type), ~columns),
+        terminal.separate_columns(_score_type_statistics(state, score_type), columns),
         score_type,
         basis.column_strength_index,
         jax.tree.map(lambda leaf: leaf[linear_index].astype(float), best),
@@ -327,15 +326,13 @@ def reward_std(
     if basis.prefixes:  # a step adds 1 to the number of steps, and V_0 is no part of its reward
         features = jnp.append(features, jnp.ones((*features.shape[:-1], 1)), axis=-1)
         covariance = covariance._replace(centre=jnp.zeros_like(covariance.centre), centre_variance=jnp.zeros(()))
-    std = evidence.posterior_std(_leave_out(covariance, columns), features)
+    std = evidence.posterior_std(covariance, features)
     if state.log_odds is None:
         return std
-    log_odds_std = evidence.posterior_std(_leave_out(logistic.covariance(state.log_odds), columns), features)
+    log_odds = logistic.covariance(state.log_odds)
+    log_odds = log_odds._replace(root=jnp.where(columns, 0, log_odds.root))  # terminal inputs are not paid
+    log_odds_std = evidence.posterior_std(log_odds, features)
     return jnp.where(index == n_linear, log_odds_std, std)
-
-
-def _leave_out(covariance: PosteriorCovariance, columns: Bool[Array, " columns"]) -> PosteriorCovariance:
-    return covariance._replace(root=jnp.where(columns, 0, covariance.root))
 
 
 def fit_signs(state: ClosedForm) -> ClosedForm:

@@ -28,7 +28,8 @@ Pairs can replace lines too. If at most one of two factors is not 0, such as fac
 is exactly linear in them. So the line c_i u_i + c_j u_j that is closest to a pair over all steps, times the pair's weight, is added to
 the weights of u_i and u_j. Only the rest of the pair says that the effect of a factor depends on another one.
 
-A start value of the returns is subtracted first: R - c is explained, and (R - c) / T in place of R / T.
+A start value of the returns is subtracted first: R - c is explained, and (R - c) / T in place of R / T. Terminal inputs explain only
+what all others leave (`terminal.py`).
 """
 
 from dataclasses import replace
@@ -38,7 +39,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lare_rl.credit import closed_form, evidence, relevance
+from lare_rl.credit import closed_form, evidence, relevance, terminal
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import ClosedForm
 from lare_rl.credit.decoder_state import CreditBatch, valid_rows
@@ -113,6 +114,8 @@ class Explanation(NamedTuple):
     """The share of the variance of each factor's effect that this line has; 1 for a factor without effect."""
     std: Float[AnyArray, " factors"] = _NO_FACTORS
     """The standard deviation that `slope` is for, in the factor's own unit."""
+    terminal: Bool[AnyArray, " factors"] = _NO_FACTORS > 0
+    """Whether the factor varies only in the last steps of episodes (`terminal.py`)."""
     same_as: Int[AnyArray, " factors"] = np.zeros(0, int)
     """The index of another factor with the same mean in all episodes, up to scale and offset; -1 if there is none."""
 
@@ -149,7 +152,8 @@ def explain(
     if basis.start_value:
         statistics, basis = _subtract(statistics, basis.n_features, start_value), replace(basis, start_value=False)
     is_factor = basis.is_factor_feature
-    full = _fit(statistics, score_type, basis.group_index, basis.strength_index)
+    columns = terminal.terminal_columns(basis, statistics, state.closed_form.before_end)
+    full = _fit(statistics, score_type, basis.group_index, basis.strength_index, columns)
     raw_single, raw_pairs = _input_shares(full.feature_shares[~is_factor], basis.n_raw_used, basis.raw_frequencies)
     raw_shares = raw_single + raw_pairs
     mean_length = statistics.n_steps / jnp.maximum(statistics.n_episodes, 1)
@@ -165,10 +169,11 @@ def explain(
     if not is_factor.any():
         return explanation
     factor_statistics, group_index = _select(statistics, np.flatnonzero(is_factor)), basis.group_index[is_factor]
-    lines = _lines_of_pairs(state)
-    factors = _fit(factor_statistics, score_type, group_index, group_index, lines)
+    lines, columns = _lines_of_pairs(state), columns[: basis.n_factor_features]
+    factors = _fit(factor_statistics, score_type, group_index, group_index, columns, lines)
     single, pairs = _input_shares(factors.feature_shares, basis.n_factors, basis.factor_frequencies)
-    root = evidence.posterior_covariance(factor_statistics, score_type, group_index, factors.posterior).root
+    separate = terminal.separate_columns(factor_statistics, columns)
+    root = evidence.posterior_covariance(separate, score_type, group_index, factors.posterior).root
     root = root + root @ lines.T
     slope, slope_covariance, linear_share = _slopes(
         factors.posterior.weight + lines @ factors.posterior.weight, root.T @ root, state
@@ -185,6 +190,7 @@ def explain(
         slope_covariance=slope_covariance / divisor**2,
         linear_share=linear_share,
         std=state.closed_form.decoder.std[: basis.n_factors],
+        terminal=columns[: basis.n_factors],
         same_as=_same_as(factors.problem.s[: basis.n_factors, : basis.n_factors]),
         residual_correlation=_residual_correlation(full.problem, basis, factors.posterior),
     )
@@ -205,20 +211,31 @@ def _fit(
     score_type: Int[Array, ""] | int,
     group_index: AlphaIndex,
     strength_index: AlphaIndex,
+    columns: Bool[Array, " features"],
     lines: Float[Array, "features features"] | float = 0.0,
 ) -> _Fit:
+    """Fit the features, and what they leave to the terminal `columns` among them."""
     problem, indices = evidence.regression(statistics, score_type, group_index), (group_index, strength_index)
     start, earlier = map(evidence.init_posterior, indices)
-    groups, strengths = relevance.fit(statistics, score_type, *indices, start, earlier, MAX_EXPLANATION_ROUNDS)
+    not_terminal, rounds = terminal.keep_columns(statistics, ~columns), MAX_EXPLANATION_ROUNDS
+    groups, strengths = relevance.fit(not_terminal, score_type, *indices, start, earlier, rounds)
     posterior = relevance.select(strengths, groups, *indices)
-    r2 = 1 - problem.dof / (problem.q * jnp.where(posterior.beta > 0, posterior.beta, 1))
-    r2 = jnp.where((problem.dof > 1) & (problem.y_std > 0), jnp.clip(r2, 0, 1), jnp.nan)
+    second = terminal.fit_residual(statistics, score_type, group_index, posterior.weight, columns, rounds)
+    posterior = posterior._replace(weight=jnp.where(columns, second.weight, posterior.weight))
+    unexplained = _unexplained(problem, posterior)
+    unexplained = unexplained * jnp.where(jnp.any(columns), _unexplained(problem, second), 1)
+    r2 = jnp.where((problem.dof > 1) & (problem.y_std > 0), 1 - unexplained, jnp.nan)
     weight = posterior.weight / jnp.where(problem.y_std > 0, problem.y_std, 1)
     covariance = problem.s @ weight
     covariance = (weight + jnp.dot(lines, weight)) * (covariance - jnp.dot(covariance, lines))
     total = jnp.sum(covariance)
     has_own_strengths = relevance.is_better(strengths, groups)
     return _Fit(problem, posterior, has_own_strengths, r2, r2 * covariance / jnp.where(total > 0, total, 1))
+
+
+def _unexplained(problem: Regression, posterior: Posterior) -> Float[Array, ""]:
+    """Return the share of the variation that a fit does not explain, corrected for its degrees of freedom."""
+    return jnp.clip(problem.dof / (problem.q * jnp.where(posterior.beta > 0, posterior.beta, 1)), 0, 1)
 
 
 def _is_used(fit: _Fit, basis: Basis) -> Bool[Array, " raw"]:

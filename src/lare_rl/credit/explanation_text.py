@@ -102,6 +102,7 @@ MESSAGES = {
     "equal_means": "its mean is the same in all episodes, so returns do not tell what it pays",
     "before_and_after": " (before: {before}; after: {after})",
     "depends_on_factor": " (its effect depends on another factor)",
+    "terminal": " (it varies only in the last step of an episode, so it is paid only for what the others leave unexplained)",
     "is_curved": " (its effect is curved)",
     "same_as": " (the same as {name}: their effects cannot be told apart; leave one of the two out of phi)",
     "about_states": (
@@ -333,7 +334,9 @@ def _effect(explanation: Explanation, indices: list[int]) -> Finding:
 
 
 def _effect_shape(explanation: Explanation, i: int, names: Sequence[str]) -> Finding | None:
-    """Report a factor if the reward does not simply rise or fall with it, or if another factor is the same."""
+    """Report a factor if it is terminal, if the reward does not simply rise or fall with it, or if another factor is the same."""
+    if explanation.terminal[i]:
+        return Finding("terminal")
     share, same = explanation.factor_shares[i], int(explanation.same_as[i])
     if same >= 0 and base_name(names[same]) != base_name(names[i]):
         return Finding("same_as", {"name": base_name(names[same])})

@@ -16,35 +16,42 @@ from jaxtyping import Array, Bool, Float, Int
 from lare_rl.credit import evidence
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.evidence import SufficientStatistics
-from lare_rl.credit.precisions import AlphaIndex, Posterior
+from lare_rl.credit.precisions import AlphaIndex, Posterior, varies
 from lare_rl.nn.normalise import RunningMeanStd, running_std
 
-__all__ = ["fit_residual", "is_terminal", "keep_columns", "terminal_columns"]
+__all__ = ["fit_residual", "keep_columns", "separate_columns", "terminal_columns"]
 
 
-def is_terminal(before_end: RunningMeanStd, std: Float[Array, " inputs"]) -> Bool[Array, " inputs"]:
-    """Return which inputs vary only in the last steps. `before_end` is of all other steps, `std` of all steps.
-
-    If there are no other steps, as in episodes of one step, no input is terminal.
-    """
-    return (before_end.n_rows > 0) & (running_std(before_end) == 0) & (std > 0)
-
-
-def terminal_columns(basis: Basis, inputs: Bool[Array, " inputs"]) -> Bool[Array, " columns"]:
+def terminal_columns(
+    basis: Basis, statistics: SufficientStatistics, before_end: RunningMeanStd
+) -> Bool[Array, " columns"]:
     """Return which columns of a fit are features of terminal inputs. A pair is, if one of its inputs is.
 
-    In a fit to prefixes none is: only the last prefix of an episode has its end.
+    `before_end` is of all steps but the last ones. If there are no such steps, as in episodes of one step, no input is terminal. In a fit
+    to prefixes none is, because only the last prefix of an episode has its end.
     """
+    n_columns, n_steps = basis.n_columns, jnp.maximum(statistics.n_steps, 1)
     if basis.prefixes:
-        return jnp.zeros(basis.n_columns, bool)
-    features = jnp.any(basis.reads_input & inputs, axis=1)
-    return jnp.pad(features, (0, basis.n_columns - basis.n_features))
+        return jnp.zeros(n_columns, bool)
+    is_constant = (before_end.n_rows > 0) & (running_std(before_end) == 0)
+    features = jnp.any(basis.reads_input & is_constant, axis=1)
+    squares = jnp.diagonal(statistics.products)[:n_columns]
+    return jnp.pad(features, (0, n_columns - basis.n_features)) & varies(
+        squares / n_steps, statistics.mean[:n_columns] ** 2
+    )
 
 
 def keep_columns(statistics: SufficientStatistics, is_kept: Bool[Array, " columns"]) -> SufficientStatistics:
     """Return the sums without the variation of some columns, whose weights are then 0 in a fit."""
     is_kept = jnp.concatenate([is_kept, jnp.ones(2, bool)])  # R/T and R
     return statistics._replace(products=jnp.where(jnp.outer(is_kept, is_kept), statistics.products, 0))
+
+
+def separate_columns(statistics: SufficientStatistics, columns: Bool[Array, " columns"]) -> SufficientStatistics:
+    """Return the sums without the products of these columns and the others: those of two separate fits."""
+    is_separate = jnp.logical_xor(columns[:, None], columns)
+    products = jnp.where(jnp.pad(is_separate, (0, 2)), 0, statistics.products)
+    return statistics._replace(products=products)
 
 
 def fit_residual(
