@@ -31,24 +31,13 @@ def add_episodes(state, rows, length, returns):
     features = state.decoder.features(rows)
     number = jnp.repeat(jnp.arange(len(length)), length, total_repeat_length=len(rows))
     means = jax.ops.segment_sum(features, number, len(length)) / length[:, None]
-    statistics = closed_form.to_float64(state.sufficient_statistics)
+    statistics = evidence.to_float64(state.sufficient_statistics)
     statistics = evidence.add_episodes(statistics, means, returns, length)
-    return state._replace(sufficient_statistics=closed_form.split_double(statistics))
+    return state._replace(sufficient_statistics=evidence.split_double(statistics))
 
 
 def observed(rows):
     return update_mean_std(empty_mean_std(rows.shape[1]), jnp.asarray(rows, jnp.float32))
-
-
-def test_split_double():
-    with jax.enable_x64(True):
-        numbers = jnp.asarray(1e6 + np.random.default_rng(0).normal(size=10))
-        statistics = evidence.empty_statistics(8)._replace(mean=numbers)
-        stored = closed_form.split_double(statistics)
-        assert {leaf.dtype for leaf in stored} == {np.dtype(np.float32)}
-        np.testing.assert_allclose(closed_form.to_float64(stored).mean, numbers, rtol=1e-14)
-        # On a GPU, XLA may leave out a conversion to float32 and back, but not this operation.
-        assert "reduce_precision" in str(jax.make_jaxpr(closed_form.split_double)(statistics))
 
 
 def fit_signs_in_float64(state):

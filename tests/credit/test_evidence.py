@@ -268,3 +268,13 @@ def test_irrelevant_factors_do_not_harm(seed, count, noise, max_steps):
     factors_error, raw_error, both_error = compare_features(seed, count, noise, max_steps, "irrelevant")
     assert both_error <= raw_error + 0.1 + 2.0 / count
     assert both_error < factors_error
+
+
+def test_split_double():
+    numbers = jnp.asarray(1e6 + np.random.default_rng(0).normal(size=10))
+    statistics = evidence.empty_statistics(8)._replace(mean=numbers)
+    stored = evidence.split_double(statistics)
+    assert {leaf.dtype for leaf in stored} == {np.dtype(np.float32)}
+    np.testing.assert_allclose(evidence.to_float64(stored).mean, numbers, rtol=1e-14)
+    # On a GPU, XLA may leave out a conversion to float32 and back, but not this operation.
+    assert "reduce_precision" in str(jax.make_jaxpr(evidence.split_double)(statistics))

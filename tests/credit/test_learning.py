@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.credit_specs import observation_spec
-from lare_rl.credit import closed_form, decoder_state, learning
+from lare_rl.credit import decoder_state, evidence, learning
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.methods import METHODS, Fit
@@ -76,7 +76,7 @@ def test_prefixes_are_summed_like_separate_cases():
     )
     with float64():
         closed = learning.add_to_sums(decoder.closed_form, batch)
-        statistics = jax.tree.map(np.asarray, closed_form.to_float64(closed.sufficient_statistics))
+        statistics = jax.tree.map(np.asarray, evidence.to_float64(closed.sufficient_statistics))
     cases = []
     for first, k in ((0, 0), (4, 2)):
         for t in range(1, lengths[k] + 1):

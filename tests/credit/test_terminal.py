@@ -75,7 +75,7 @@ def test_fit_in_episodes_of_one_step_knows_no_end():
 def test_fit_of_log_odds_ignores_terminal_inputs():
     state, _, _ = fit(np.random.default_rng(1).integers(2, 8, N_EPISODES), "bayes", "binary")
     closed = state.closed_form
-    statistics = closed_form.to_float64(closed.sufficient_statistics)
+    statistics = evidence.to_float64(closed.sufficient_statistics)
     columns = np.asarray(terminal.terminal_columns(closed.decoder.basis, statistics, closed.before_end))
     weight = np.asarray(closed.log_odds.posterior.weight)
     assert not weight[columns].any()

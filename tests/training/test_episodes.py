@@ -20,7 +20,7 @@ from helpers.small_configs import (
     small_config,
     untrained_learner,
 )
-from lare_rl.credit import closed_form, decoder_state, learning, logistic
+from lare_rl.credit import closed_form, decoder_state, evidence, learning, logistic
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.data import replay
@@ -54,7 +54,7 @@ def learn_in_chunks(config, steps, factors, n_chunks):
         yield learner
 
 
-to_float64 = jax.jit(closed_form.to_float64)
+to_float64 = jax.jit(evidence.to_float64)
 
 
 def statistics_of(closed):

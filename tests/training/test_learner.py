@@ -27,7 +27,7 @@ from helpers.small_configs import (
     with_factor_decoders,
     with_other_dead_values,
 )
-from lare_rl.credit import closed_form
+from lare_rl.credit import evidence
 from lare_rl.credit.rewards import proxy_rewards
 from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.decoder_fits import sample_credit, update_decoders
@@ -81,7 +81,7 @@ def check_closed_form(credit, z, reward):
     length = np.array([len(rows) for rows in z])
     centred = np.array(v) - np.average(v, axis=0, weights=length)
     with jax.enable_x64(True):
-        sums = closed_form.to_float64(credit.closed_form.sufficient_statistics)
+        sums = evidence.to_float64(credit.closed_form.sufficient_statistics)
     assert (float(sums.n_episodes), float(sums.n_steps)) == (len(z), length.sum())
     np.testing.assert_allclose(sums.mean, np.average(v, axis=0, weights=length), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(sums.products, (length * centred.T) @ centred, rtol=1e-3, atol=1e-4)

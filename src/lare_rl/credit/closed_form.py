@@ -59,9 +59,7 @@ __all__ = [
     "is_stale",
     "reset_statistics",
     "reward_std",
-    "split_double",
     "target_scale",
-    "to_float64",
 ]
 
 MAX_SIGNED_FACTORS = 16
@@ -80,7 +78,7 @@ class ClosedForm(NamedTuple):
     decoder: LinearDecoder
     """The decoder of each score type, along a leading axis."""
     sufficient_statistics: SufficientStatistics
-    """Each number is held as two float32 numbers (`split_double`)."""
+    """Each number is held as two float32 numbers (`evidence.split_double`)."""
     n_steps: Float[Array, ""]
     """The number of rows (one for each agent and step) that mean and std were computed from."""
     before_end: RunningMeanStd
@@ -110,7 +108,7 @@ def init(basis: Basis, score_types: tuple[int, ...]) -> ClosedForm:
     )
     return ClosedForm(
         decoder=linear_decoder.init(basis, n_score_types),
-        sufficient_statistics=split_double(evidence.empty_statistics(basis.n_columns)),
+        sufficient_statistics=evidence.split_double(evidence.empty_statistics(basis.n_columns)),
         n_steps=jnp.zeros(()),
         before_end=empty_mean_std(basis.n_standardised),
         n_fitted=jnp.zeros(()),
@@ -120,22 +118,6 @@ def init(basis: Basis, score_types: tuple[int, ...]) -> ClosedForm:
         start_value=jnp.zeros(n_score_types),
         log_odds=logistic.init(basis.column_group_index) if has_log_odds else None,
     )
-
-
-def split_double(statistics: SufficientStatistics) -> SufficientStatistics:
-    """Split each number into two float32 numbers that add up to it, along a new leading axis."""
-
-    def split(number: Array) -> Float[Array, "2 *shape"]:
-        # Not number.astype(float32): XLA may leave out a conversion to float32 and back, and the second number would be 0.
-        high = jax.lax.reduce_precision(number, exponent_bits=8, mantissa_bits=23)
-        return jnp.stack([high, number - high]).astype(jnp.float32)
-
-    return jax.tree.map(split, statistics)
-
-
-def to_float64(statistics: SufficientStatistics) -> SufficientStatistics:
-    """Invert `split_double`, in float64 if that is enabled."""
-    return jax.tree.map(lambda number: jnp.sum(number.astype(float), axis=0), statistics)
 
 
 def is_stale(state: ClosedForm, inputs: RunningMeanStd) -> Bool[Array, ""]:
@@ -221,7 +203,7 @@ def _fit_linear_types(
 
 
 def _terminal_columns(state: ClosedForm) -> Bool[Array, " columns"]:
-    statistics = to_float64(state.sufficient_statistics)
+    statistics = evidence.to_float64(state.sufficient_statistics)
     return terminal.terminal_columns(state.decoder.basis, statistics, state.before_end)
 
 
@@ -254,7 +236,7 @@ def _score_type_statistics(state: ClosedForm, score_type: Int[Array, ""] | int) 
 
     Unless the score is a sum, 1/T has the weight 0: an average has a constant part already.
     """
-    statistics, basis = to_float64(state.sufficient_statistics), state.decoder.basis
+    statistics, basis = evidence.to_float64(state.sufficient_statistics), state.decoder.basis
     if not basis.start_value:
         return statistics
     unit = jnp.ones(len(statistics.mean)).at[basis.n_features].set(_start_value_unit(state))
@@ -265,7 +247,7 @@ def _score_type_statistics(state: ClosedForm, score_type: Int[Array, ""] | int) 
 
 def _start_value_unit(state: ClosedForm) -> Float[Array, ""]:
     """Return what the column 1/T is multiplied by, the inverse of its mean."""
-    mean = to_float64(state.sufficient_statistics).mean[state.decoder.basis.n_features]
+    mean = evidence.to_float64(state.sufficient_statistics).mean[state.decoder.basis.n_features]
     return 1 / jnp.where(mean > 0, mean, 1)
 
 
@@ -284,7 +266,7 @@ def _centre_average(state: ClosedForm, weights: _Weights, index: int) -> _Weight
     Otherwise T r_hat would be near the mean return at every step. If that is negative, each step costs something, and an agent that can end
     an episode learns to end it, although this does not raise the average.
     """
-    n_features, step_mean = state.decoder.basis.n_features, to_float64(state.sufficient_statistics).mean
+    n_features, step_mean = state.decoder.basis.n_features, evidence.to_float64(state.sufficient_statistics).mean
     # The intercepts of levels are left out: no step is paid for them.
     mean = weights.bias[index] + weights.weight[index, :n_features] @ step_mean[:n_features]
     bias, start_value = weights.bias.at[index].add(-mean), weights.start_value.at[index].add(mean)
@@ -296,7 +278,7 @@ def target_scale(state: ClosedForm, *, is_average: Bool[Array, ""], index: Int[A
 
     Episodes have the weight T. `index` is the position of the score type among all that are fitted.
     """
-    statistics, basis = to_float64(state.sufficient_statistics), state.decoder.basis
+    statistics, basis = evidence.to_float64(state.sufficient_statistics), state.decoder.basis
     mean, start = statistics.mean, state.start_value[index]
     moments = statistics.products / jnp.maximum(statistics.n_steps, 1) + jnp.outer(mean, mean)
     average_square = moments[-1, -1] - 2 * start * mean[-1] + start**2
@@ -337,7 +319,7 @@ def reward_std(
 
 def fit_signs(state: ClosedForm) -> ClosedForm:
     """Choose the signs for which the signed sum of the factors fits the returns best. Among equally good ones, take the first."""
-    statistics, n_factors = to_float64(state.sufficient_statistics), state.decoder.basis.n_features
+    statistics, n_factors = evidence.to_float64(state.sufficient_statistics), state.decoder.basis.n_features
     signs = jnp.asarray(np.array(list(itertools.product((1.0, -1.0), repeat=n_factors))))
     # With v = (m, R/T): sum_k T_k (v_k . (w, -1))^2 is the same sum about the mean, plus n_steps * (mean . (w, -1))^2.
     v = jnp.concatenate([signs, -jnp.ones((len(signs), 1))], axis=1)

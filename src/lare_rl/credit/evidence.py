@@ -56,7 +56,9 @@ __all__ = [
     "posterior_covariance",
     "posterior_std",
     "regression",
+    "split_double",
     "starting_precisions",
+    "to_float64",
     "unscale",
 ]
 
@@ -87,6 +89,22 @@ def empty_statistics(n_features: int) -> SufficientStatistics:
     """Return the statistics of no episodes."""
     size = n_features + 2
     return SufficientStatistics(jnp.zeros(()), jnp.zeros(()), jnp.zeros(size), jnp.zeros((size, size)))
+
+
+def split_double(statistics: SufficientStatistics) -> SufficientStatistics:
+    """Split each number into two float32 numbers that add up to it, along a new leading axis."""
+
+    def split(number: Array) -> Float[Array, "2 *shape"]:
+        # Not number.astype(float32): XLA may leave out a conversion to float32 and back, and the second number would be 0.
+        high = jax.lax.reduce_precision(number, exponent_bits=8, mantissa_bits=23)
+        return jnp.stack([high, number - high]).astype(jnp.float32)
+
+    return jax.tree.map(split, statistics)
+
+
+def to_float64(statistics: SufficientStatistics) -> SufficientStatistics:
+    """Invert `split_double`, in float64 if that is enabled."""
+    return jax.tree.map(lambda number: jnp.sum(number.astype(float), axis=0), statistics)
 
 
 def add_episodes(

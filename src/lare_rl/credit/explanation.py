@@ -147,7 +147,7 @@ def explain(
     state: ExplanationState, score_type: Int[Array, ""] | int, start_value: Float[Array, ""] | float = 0.0
 ) -> Explanation:
     """Explain the returns of the episodes in the sums, less their start value. Call this within `float64()`."""
-    statistics, basis = closed_form.to_float64(state.closed_form.sufficient_statistics), state.closed_form.decoder.basis
+    statistics, basis = evidence.to_float64(state.closed_form.sufficient_statistics), state.closed_form.decoder.basis
     explains_mean_reward = (score_type == ScoreType.SUM) & _lengths_differ(statistics)
     if basis.start_value:
         statistics, basis = _subtract(statistics, basis.n_features, start_value), replace(basis, start_value=False)

@@ -168,7 +168,7 @@ def _append_levels(
 
 def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     """Add whole episodes to the sums, in float64 if that is enabled. Episodes whose mask is 0 are ignored."""
-    statistics = closed_form.to_float64(closed.sufficient_statistics)
+    statistics = evidence.to_float64(closed.sufficient_statistics)
     returns, mask = episodes.returns, episodes.mask > 0
     if closed.decoder.basis.prefixes:
         columns, is_step = _prefix_columns(closed.decoder, episodes), decoder_state.step_rows(episodes)
@@ -177,7 +177,7 @@ def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
         columns = _columns(closed.decoder, episodes)
         statistics = evidence.add_episodes(statistics, columns, returns, jnp.where(mask, episodes.length, 0))
     closed = closed._replace(
-        sufficient_statistics=closed_form.split_double(statistics),
+        sufficient_statistics=evidence.split_double(statistics),
         before_end=_add_before_end(closed.before_end, episodes),
     )
     return add_to_log_odds(closed, episodes)
