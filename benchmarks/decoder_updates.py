@@ -46,7 +46,7 @@ def make_config(name: str) -> TrainConfig:
         consumes=ippo.consumes,
         algorithm=ippo,
         hyperparameters=ippo.settings,
-        credit=CreditSettings(steps=32 * MAX_STEPS),
+        credit=CreditSettings(batch_steps=32 * MAX_STEPS),
         scale_rewards=False,
         n_factors=(),
         n_envs=STORED,

@@ -47,7 +47,7 @@ def updates(
         return descent.update(credit, episodes, key, spec)[0], None
 
     n_steps = min(config.credit.sampled_steps, config.env.max_steps)
-    n_episodes = max(1, config.credit.steps // config.credit.sampled_steps)
+    n_episodes = max(1, config.credit.batch_steps // config.credit.sampled_steps)
     samples = sample_episode_steps(stored_replay, key, STRETCH, n_episodes, n_steps)
     return jax.lax.scan(update, credit, samples)[0]
 

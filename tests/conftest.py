@@ -186,7 +186,7 @@ def small_many():
             "capacity": 400,
             "ippo": PPOSettings(hidden=(8,), minibatch_size=100, epochs=1),
             **{name: ALGORITHMS[name].settings.model_copy(update=quick) for name in ("qmix", "vdn")},
-            "credit": QUICK_CREDIT | {"steps": 50, "sampled_steps": 5},
+            "credit": QUICK_CREDIT | {"batch_steps": 50, "sampled_steps": 5},
         }
         return Settings(**(values | changes))
 

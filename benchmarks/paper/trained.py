@@ -121,7 +121,7 @@ def single_agent_notes(runs: Mapping[str, Run]) -> Iterator[str]:
             yield (
                 f"Episodes of fewer than {n_sampled} steps are taken whole (the paper: {n_sampled} steps with replacement). So RRD and "
                 f"RRD-unbiased have the loss of RD on {task}, whose episodes have {longest} steps; an update reads "
-                f"{credit.steps // n_sampled} episodes, and {credit.steps // longest} for RD."
+                f"{credit.batch_steps // n_sampled} episodes, and {credit.batch_steps // longest} for RD."
             )
     before = [task for task, run in runs.items() if run.config.task.scored_observation == "before"]
     exception = (

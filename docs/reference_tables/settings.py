@@ -36,9 +36,9 @@ ALGORITHM_GROUPS = {"TD3, DDPG and SAC": "td3 ddpg sac", "PPO and IPPO": "ppo ip
 
 
 FORMS = (
-    ("TOML", "`evaluate_every = 1000`", "`td3 = { warmup = 1000 }`", "`credit = { steps = 512 }`"),
-    ("command line", "`--evaluate-every 1000`", "`--td3.warmup 1000`", "`--credit.steps 512`"),
-    ("Python: `Settings(...)`", "`evaluate_every=1000`", '`td3={"warmup": 1000}`', '`credit={"steps": 512}`'),
+    ("TOML", "`evaluate_every = 1000`", "`td3 = { warmup = 1000 }`", "`credit = { batch_steps = 512 }`"),
+    ("command line", "`--evaluate-every 1000`", "`--td3.warmup 1000`", "`--credit.batch-steps 512`"),
+    ("Python: `Settings(...)`", "`evaluate_every=1000`", '`td3={"warmup": 1000}`', '`credit={"batch_steps": 512}`'),
 )
 """How settings are given."""
 

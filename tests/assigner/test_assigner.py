@@ -143,7 +143,7 @@ def test_no_step_is_paid_for_the_start_value_of_a_sum(start_value, phi):
 @pytest.mark.long
 @pytest.mark.parametrize("groups", [False, True])
 def test_gradient_decoders_pay_no_step_for_the_start_value(groups):
-    settings = SMALL_CREDIT.model_copy(update={"score": "auto", "learning_rate": 0.01, "steps": 100})
+    settings = SMALL_CREDIT.model_copy(update={"score": "auto", "learning_rate": 0.01, "batch_steps": 100})
     credit = small_assigner("rd", settings=settings, groups=groups)
     episodes = random_episodes([14, 3, 8, 5] * 15)
     for i, (*steps, reward) in enumerate(episodes):
@@ -419,7 +419,7 @@ NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
         ("rd", None, {"agents": 2}, "max_steps"),
         ("ircr", None, {"scale_rewards": True}, "scale_rewards"),
         ("rd-linear", None, {"observation_space": 10_000}, "1024 .*10001"),
-        ("rrdu", None, {"settings": CreditSettings(sampled_steps=8, steps=4)}, r"steps = 4,.*sampled_steps = 8"),
+        ("rrdu", None, {"settings": CreditSettings(sampled_steps=8, batch_steps=4)}, r"steps = 4,.*sampled_steps = 8"),
         ("rd", None, {"action_space": None}, "action_space"),
         ("rd", None, {"task": TASK, "observation_space": 3}, "observation_space .*3 .*observation_size = 2"),
         ("rd", None, {"capacity": 0}, "capacity = 0"),
@@ -576,7 +576,7 @@ def test_must_learn_the_value_of_events_in_order():
 def test_must_not_credit_steps_for_the_level(method, tmp_path):
     """Easy levels have larger returns and another state. With groups, the state gets no credit."""
     rng, names = np.random.default_rng(0), ("easy", "hard", "night")
-    settings = SMALL_CREDIT.model_copy(update={"learning_rate": 0.01, "steps": 100})
+    settings = SMALL_CREDIT.model_copy(update={"learning_rate": 0.01, "batch_steps": 100})
     grouped, blind = (small_assigner(method, groups=groups, settings=settings) for groups in (True, False))
     episodes = random_episodes([10] * 90)
     for i, episode in enumerate(episodes):

@@ -52,7 +52,7 @@ def sample(store, method, seed=0, **settings):
 
 def test_sample_batch_draws_steps_without_replacement():
     for seed in range(5):
-        batch = sample(filled_store(), "rrdu", seed, sampled_steps=4, steps=24)
+        batch = sample(filled_store(), "rrdu", seed, sampled_steps=4, batch_steps=24)
         assert batch.inputs.shape == (24, 2)
         episodes = sampled_episodes(batch)
         assert len(episodes) == 6
@@ -66,9 +66,9 @@ def test_sample_batch_packs_whole_stored_episodes():
         store, numbers = filled_store(capacity), set()
         assert (len(store.episodes) == 5) == (capacity == 100)
         for seed in range(20):
-            batch = sample(store, "rd", seed, sampled_steps=4, steps=24)
+            batch = sample(store, "rd", seed, sampled_steps=4, batch_steps=24)
             assert (batch.inputs.shape, batch.length.shape) == ((24, 2), (12,))
-            small = sample(store, "rd", seed, sampled_steps=2, steps=4)
+            small = sample(store, "rd", seed, sampled_steps=2, batch_steps=4)
             assert small.inputs.shape == (16, 2)  # there is room for the longest episode
             for number, steps in sampled_episodes(batch) + sampled_episodes(small):
                 assert steps == list(range(LENGTHS[number]))

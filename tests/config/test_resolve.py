@@ -37,7 +37,7 @@ def resolve_named(task, settings):
         ("CN-6", {"method": "diaster"}, ["diaster", "single agent", "6"]),
         ("Reacher-v4", {"method": "llm-reward", "scored_observation": "both"}, ["llm-reward", "scored_observation"]),
         ("Reacher-v4", {"method": "ircr", "scale_rewards": True}, ["scale_rewards", "ircr"]),
-        ("Reacher-v4", {"method": "rrd", "credit": {"steps": 16}}, ["steps = 16", "sampled_steps = 64"]),
+        ("Reacher-v4", {"method": "rrd", "credit": {"batch_steps": 16}}, ["steps = 16", "sampled_steps = 64"]),
         ("Reacher-v4", {"overlap_collection": True, "td3": {"warmup": 0}}, ["overlap_collection", "td3.warmup to 1"]),
         ("Reacher-v4", {"rollout_steps": 20, "steps": 20}, ["steps = 20", "50"]),
         ("CN-6", {"capacity": 6149, "method": "rd"}, ["capacity = 6149", "rollout", "6150"]),
@@ -173,7 +173,7 @@ def check(method, agents=1, observation_size=9, credit=SUM_CREDIT, **changes):
         ("rudder", {"agents": 3}, ["single agent", "3"]),
         ("bayes", {"observation_size": 7056}, ["1024", "7057", "rrdu"]),
         ("rd-linear", {"observation_size": 1024}, ["1024", "1025"]),
-        ("rrd", {"credit": CreditSettings(steps=16)}, ["sampled_steps"]),
+        ("rrd", {"credit": CreditSettings(batch_steps=16)}, ["sampled_steps"]),
         ("diaster", {"credit": CreditSettings(hidden=())}, ["hidden"]),
         ("rrdu", {"observation_size": 7056, "credit": CreditSettings(score="average")}, ["average", "1024"]),
     ],
@@ -190,9 +190,9 @@ def test_check_training_accepts():
         ("bayes", {"observation_size": 1023}),
         ("rrdu", {"observation_size": 7056}),
         ("arel", {"agents": 3, "fixed_length": True}),
-        ("rrd", {"credit": CreditSettings(steps=16), "fixed_length": True}),
-        ("rrd", {"credit": CreditSettings(steps=64)}),
-        ("rd", {"credit": CreditSettings(steps=16)}),
+        ("rrd", {"credit": CreditSettings(batch_steps=16), "fixed_length": True}),
+        ("rrd", {"credit": CreditSettings(batch_steps=64)}),
+        ("rd", {"credit": CreditSettings(batch_steps=16)}),
     ]
     for method, changes in cases:
         check(method, **changes)

@@ -29,7 +29,7 @@ def test_settings_complete_hyperparameters_from_the_algorithm(name):
 @pytest.mark.parametrize(
     ("settings", "texts"),
     [
-        ({"credit": {"step": 800}}, ["'credit.step'", "'steps'"]),
+        ({"credit": {"sampled_step": 8}}, ["'credit.sampled_step'", "'sampled_steps'"]),
         ({"credit": {"sampled_steps": 1}}, ["credit.sampled_steps = 1"]),
         ({"credit": {"hidden": (0,)}}, ["credit.hidden", "0"]),
         ({"gamma": 0.9}, ["'gamma'", "'td3.gamma'"]),
@@ -51,11 +51,16 @@ def test_settings_refuse(settings, texts):
 
 
 def test_settings_accept_models_and_mappings():
-    settings = Settings(credit={"steps": 800}, ippo={"gae_lambda": 1.0}, method="dense")
-    assert settings.credit.steps == 800
+    settings = Settings(credit={"batch_steps": 800}, ippo={"gae_lambda": 1.0}, method="dense")
+    assert settings.credit.batch_steps == 800
     assert settings.ippo == ALGORITHMS["ippo"].settings.model_copy(update={"gae_lambda": 1.0})
-    assert Settings(credit=CreditSettings(steps=800), ippo=PPOSettings(gae_lambda=1.0), method="dense") == settings
+    assert (
+        Settings(credit=CreditSettings(batch_steps=800), ippo=PPOSettings(gae_lambda=1.0), method="dense") == settings
+    )
     assert Settings(**settings.model_dump(exclude_unset=True)) == settings
+    old_names = {"steps": 800, "drawn_steps": 7, "episodes": 9}
+    new_names = CreditSettings(batch_steps=800, sampled_steps=7, batch_episodes=9)
+    assert Settings(credit=old_names).credit == new_names
 
 
 @pytest.mark.parametrize(("task", "algorithm"), [("Reacher-v4", "sac"), ("Reacher-v4", "ddpg"), ("CN-6", None)])
@@ -79,8 +84,8 @@ def test_resolved_settings_round_trip(task, algorithm):
         ("Reacher-v4", {"method": "rd", "credit": {"sampled_steps": 10}}, ["credit.sampled_steps"]),
         ("Reacher-v4", {"method": "rrd", "credit": {"sampled_steps": 10}}, []),
         ("Reacher-v4", {"method": "lare-linear", "credit": {"sum_form": True, "score": "sum"}}, ["credit.sum_form"]),
-        ("Reacher-v4", {"method": "lare-rrdu", "credit": {"episodes": 1}}, ["credit.episodes"]),
-        ("Reacher-v4", {"method": "diaster", "fit_updates": 9, "credit": {"episodes": 4}}, []),
+        ("Reacher-v4", {"method": "lare-rrdu", "credit": {"batch_episodes": 1}}, ["credit.batch_episodes"]),
+        ("Reacher-v4", {"method": "diaster", "fit_updates": 9, "credit": {"batch_episodes": 4}}, []),
         ("Reacher-v4", {"method": "rd", "fit_every": 3, "fit_updates": 9}, ["fit_every", "fit_updates"]),
         ("Reacher-v4", {"method": "rd", "algorithm": "ppo", "fit_every": 3, "fit_updates": 9}, []),
         ("Reacher-v4", {"method": "ircr", "algorithm": "ppo", "fit_updates": 3}, ["fit_updates"]),
@@ -101,9 +106,9 @@ def test_unused_settings(task, settings, names):
 
 
 def test_messages_of_unused_settings_and_warmup():
-    settings = Settings(method="dense", td3={"gamma": 0.5, "tau": 0.5}, scale_rewards=True, credit={"steps": 70})
+    settings = Settings(method="dense", td3={"gamma": 0.5, "tau": 0.5}, scale_rewards=True, credit={"batch_steps": 70})
     messages = describe_unused_settings(settings, resolve(settings, pick_spec()), pick_spec())
-    expected = {"td3.gamma": "ppo.gamma", "td3.tau": "ppo", "scale_rewards": "ppo", "credit.steps": "dense"}
+    expected = {"td3.gamma": "ppo.gamma", "td3.tau": "ppo", "scale_rewards": "ppo", "credit.batch_steps": "dense"}
     assert messages.keys() == expected.keys()
     assert all(
         f"{name} makes no difference" in messages[name] and text in messages[name] for name, text in expected.items()

@@ -22,6 +22,9 @@ from lare_rl.credit.methods import METHODS, Fit
     ],
 )
 def test_plan_batch(fit, longest, fixed_length, plan):
-    method, settings = replace(METHODS["rd"], fit=fit), CreditSettings(steps=100, sampled_steps=8, episodes=7)
+    method, settings = (
+        replace(METHODS["rd"], fit=fit),
+        CreditSettings(batch_steps=100, sampled_steps=8, batch_episodes=7),
+    )
     spec = observation_spec(1, method, settings, max_steps=1000, fixed_length=fixed_length)
     assert plan_batch(spec, longest) == plan

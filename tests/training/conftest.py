@@ -48,7 +48,7 @@ def learned_training(phi, tmp_path_factory):
         rollout_steps=20,
         evaluate_every=1200,
         td3={"hidden": (32,), "learning_rate": 3e-3, "batch_size": 64, "gamma": 0.5, "warmup": 400},
-        credit=CreditSettings(steps=64),
+        credit=CreditSettings(batch_steps=64),
     )
     listener = MessageListener()
     run = train_quietly(toy_spec(), settings, tmp_path_factory.mktemp("learned") / "run", phi, [listener])

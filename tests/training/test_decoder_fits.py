@@ -81,8 +81,8 @@ def test_count_held_out_and_config_of_first_fit():
         buffer = replay.init_replay({}, len(n_episodes), 100, 1)._replace(current_episode=jnp.array(n_episodes))
         assert decoder_fits._count_held_out(buffer, window=32).tolist() == n_held_out
     for steps, first in ((6400, 800), (400, 50), (80, 12), (10, 10)):
-        config = small_config("lare-rd", credit=CreditSettings(steps=steps))
-        assert config_of_first_fit(config).credit.steps == first
+        config = small_config("lare-rd", credit=CreditSettings(batch_steps=steps))
+        assert config_of_first_fit(config).credit.batch_steps == first
 
 
 @pytest.mark.long

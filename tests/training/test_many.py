@@ -62,7 +62,7 @@ def test_many_agents_learn_echo(algorithm, method, echo, tmp_path):
         evaluation_episodes=50,
         qmix={**small, "update_every": 4, "target_every": 40, "gamma": 0.5},
         ippo={"hidden": (32,), "learning_rate": 5e-3, "gamma": 0.5, "epochs": 5, "minibatch_size": 120},
-        credit={"hidden": (32,), "learning_rate": 3e-3, "steps": 100, "sampled_steps": 4, "score": "sum"},
+        credit={"hidden": (32,), "learning_rate": 3e-3, "batch_steps": 100, "sampled_steps": 4, "score": "sum"},
     )
     function = None if method == "dense" else verify_function(ECHO_PHI, echo)
     line = train_quietly(echo, settings, tmp_path / "run", function).metrics()[-1]

@@ -117,7 +117,7 @@ def test_functions_are_mapped_over_seeds():
         ({"method": "stas"}, "bayes"),
         ({"method": "lare-bayes"}, "phi"),
         ({"method": "bayes", "settings": CreditSettings(exact="last")}, "exact"),
-        ({"method": "rrd", "settings": CreditSettings(steps=16)}, "sampled_steps"),
+        ({"method": "rrd", "settings": CreditSettings(batch_steps=16)}, "sampled_steps"),
         ({"method": "nothing"}, "nothing"),
         ({"n_envs": 0}, "n_envs = 0"),
         ({"low": [0.0, 0.0]}, r"low = \[0.0, 0.0\].*\(1,\)"),

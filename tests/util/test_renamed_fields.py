@@ -55,6 +55,17 @@ def test_rename_keys():
 
 
 def test_rename_options():
-    arguments = ["verify", "phi.py", "--judges", "both", "--judges=after", "--fit=4", "x=1=2"]
-    new = ["verify", "phi.py", "--scored-observation", "both", "--scored-observation=after", "--fit=4", "x=1=2"]
+    arguments = ["verify", "phi.py", "--judges", "both", "--judges=after", "--fit=4", "x=1=2", "--steps"]
+    arguments += ["--credit.steps", "8", "--credit.episodes=9"]
+    new = [
+        "verify",
+        "phi.py",
+        "--scored-observation",
+        "both",
+        "--scored-observation=after",
+        "--fit=4",
+        "x=1=2",
+        "--steps",
+    ]
+    new += ["--credit.batch-steps", "8", "--credit.batch-episodes=9"]
     assert rename_options(arguments) == new

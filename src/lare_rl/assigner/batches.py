@@ -26,7 +26,7 @@ def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, lo
     """
     plan = plan_batch(spec, longest)
     if plan.layout == "packed":
-        count = max(1, spec.settings.steps * store.n_ended // store.n_ended_steps)
+        count = max(1, spec.settings.batch_steps * store.n_ended // store.n_ended_steps)
         return _pack(store, _sample_episodes(store, count, random)[: plan.episodes], plan.episodes, plan.rows)
     episodes = _sample_episodes(store, plan.episodes, random)
     length = _lengths(episodes)

@@ -53,9 +53,10 @@ def _find_problems(spec: CreditSpec, n_agents: int, discrete_actions: bool) -> I
         )
     if kind.predicts_actions and not discrete_actions:
         yield f"{name} learns which of its actions an agent took, and the task has continuous ones: use stas"
-    if "sampled_steps" in method.settings and not spec.fixed_length and settings.steps < settings.sampled_steps:
+    if "sampled_steps" in method.settings and not spec.fixed_length and settings.batch_steps < settings.sampled_steps:
         yield (
-            f"the decoder has steps = {settings.steps}, less than sampled_steps = {settings.sampled_steps} of one episode: use more steps"
+            f"the decoder has batch_steps = {settings.batch_steps}, less than sampled_steps = {settings.sampled_steps} of one episode: "
+            "use more batch_steps"
         )
     n_raw = spec.basis.n_raw
     has_no_fit = n_raw > MAX_RAW_FEATURES and not spec.basis.n_features

@@ -29,10 +29,10 @@ class CreditSettings(CheckedModel):
     """Fit an episode's return R (Eq. 6 of the paper), not R/T."""
     sampled_steps: Annotated[int, Field(ge=2, validation_alias=AliasChoices("sampled_steps", "drawn_steps"))] = 64
     """K: steps that RRD and its variants sample from an episode."""
-    steps: Annotated[int, Field(ge=2)] = 256
-    """Steps in one update: K of each of steps / K episodes, or whole episodes with about this many. On particle tasks (T = 25):
-    steps / T episodes, even if only K steps of each are sampled."""
-    episodes: Count = 8
+    batch_steps: Annotated[int, Field(ge=2, validation_alias=AliasChoices("batch_steps", "steps"))] = 256
+    """Steps in one update: K of each of batch_steps / K episodes, or whole episodes with about this many. On particle tasks (T = 25):
+    batch_steps / T episodes, even if only K steps of each are sampled."""
+    batch_episodes: Annotated[Count, Field(validation_alias=AliasChoices("batch_episodes", "episodes"))] = 8
     """diaster, rudder, grd and rbt: whole episodes in one update."""
     score: Literal["auto", "sum", "average", "binary"] = "auto"
     """The form of the score: `sum`, `average` or `binary`. `auto`: the task's `score` or, without one, a sum, unless an
@@ -59,7 +59,7 @@ MULTI_AGENT_CREDIT = CreditSettings(
     learning_rate=5e-4,
     weight_decay=1e-5,
     sampled_steps=10,
-    steps=6400,
+    batch_steps=6400,
     encoder=(256,),
     bottleneck=4,
     divergence=1e-3,

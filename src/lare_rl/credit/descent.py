@@ -29,22 +29,22 @@ class BatchPlan(NamedTuple):
 
 
 def plan_batch(spec: CreditSpec, longest: int) -> BatchPlan:
-    """Return the size of a batch with about `settings.steps` steps.
+    """Return the size of a batch with about `settings.batch_steps` steps.
 
     RRD and LRR read K sampled steps of each episode. If all episodes have the same length T, they read as many episodes as RD, so K/T
-    of the steps. A decoder with a loss of its own reads `settings.episodes` whole episodes. Other fits read whole episodes.
+    of the steps. A decoder with a loss of its own reads `settings.batch_episodes` whole episodes. Other fits read whole episodes.
     `longest` is the number of steps of the longest episode.
     """
     settings = spec.settings
     if spec.method.fit is Fit.DECODER_LOSS:
-        return BatchPlan("padded", settings.episodes, longest)
+        return BatchPlan("padded", settings.batch_episodes, longest)
     if spec.method.samples_steps:
-        n_episodes = settings.steps // (longest if spec.fixed_length else settings.sampled_steps)
+        n_episodes = settings.batch_steps // (longest if spec.fixed_length else settings.sampled_steps)
         return BatchPlan("sampled", max(1, n_episodes), min(settings.sampled_steps, longest))
     if spec.fixed_length:
-        return BatchPlan("padded", max(1, settings.steps // longest), longest)
-    n_episodes = max(1, settings.steps // 2)  # enough if the mean length is 2 or more
-    return BatchPlan("packed", n_episodes, max(settings.steps, longest))
+        return BatchPlan("padded", max(1, settings.batch_steps // longest), longest)
+    n_episodes = max(1, settings.batch_steps // 2)  # enough if the mean length is 2 or more
+    return BatchPlan("packed", n_episodes, max(settings.batch_steps, longest))
 
 
 def loss_and_gradient(

@@ -56,13 +56,13 @@ class Fit(StrEnum):
         """The names of the `CreditSettings` that the fit reads."""
         match self:
             case Fit.DECODER_LOSS:
-                names = {"episodes", "exact"}
+                names = {"batch_episodes", "exact"}
             case Fit.EVIDENCE:
                 names = {"score", "start_value", "exact"}
             case Fit.PREFIX_EVIDENCE | Fit.SIGNS:
                 names = {"exact"}
             case _:
-                names = {"score", "start_value", "sum_form", "steps", "exact"} | (
+                names = {"score", "start_value", "sum_form", "batch_steps", "exact"} | (
                     {"sampled_steps"} if self.samples_steps else set()
                 )
         return frozenset(names if self.closed_form else names | {"learning_rate", "weight_decay", "normalise"})

@@ -74,7 +74,7 @@ def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: Credi
             return sample_padded(buffer, key, updates, plan.episodes, plan.rows)
         case "packed":
             # Here every step may be an episode of its own, so `plan.episodes`, which is for `CreditAssigner`, may be too small.
-            return sample_packed(buffer, key, updates, config.credit.steps, plan.rows)
+            return sample_packed(buffer, key, updates, config.credit.batch_steps, plan.rows)
 
 
 def update_decoders(
@@ -138,8 +138,8 @@ def has_enough_episodes(learner: Learner) -> bool:
 
 def config_of_first_fit(config: TrainConfig) -> TrainConfig:
     """Return the configuration of the first fit, whose updates read fewer steps, but at least those of an episode."""
-    steps = max(config.credit.steps // BATCH_DIVISOR, min(config.longest_segment, config.credit.steps))
-    return dataclasses.replace(config, credit=config.credit.model_copy(update={"steps": steps}))
+    steps = max(config.credit.batch_steps // BATCH_DIVISOR, min(config.longest_segment, config.credit.batch_steps))
+    return dataclasses.replace(config, credit=config.credit.model_copy(update={"batch_steps": steps}))
 
 
 def fit_until_converged(

@@ -14,6 +14,9 @@ _RENAMED_KEYS = {
 }
 """From old to new keys of tasks, settings, sweeps and assigners, and to new options of the command line."""
 
+_RENAMED_OPTIONS = {"credit.episodes": "credit.batch-episodes", "credit.steps": "credit.batch-steps"}
+"""From old to new options whose last part alone is no old name."""
+
 _FREE_TABLES = {"arguments", "functions"}
 """Tables with other keys, which stay: an environment's keyword arguments, and names of tasks."""
 
@@ -123,9 +126,12 @@ def rename_options(arguments: Sequence[str]) -> list[str]:
         option, equals, value = argument.partition("=")
         table, dot, name = option.removeprefix("--").rpartition(".")
         new_name = _RENAMED_KEYS.get(name.replace("-", "_"))
-        if new_name is None or not option.startswith("--"):
+        new_option = _RENAMED_OPTIONS.get(f"{table}{dot}{name}")
+        if new_name is not None:
+            new_option = f"{table}{dot}{new_name.replace('_', '-')}"
+        if new_option is None or not option.startswith("--"):
             return argument
-        return f"--{table}{dot}{new_name.replace('_', '-')}{equals}{value}"
+        return f"--{new_option}{equals}{value}"
 
     return list(map(rename, arguments))
 

@@ -54,7 +54,7 @@ def _run_defaults(env: "EnvSpec", environments: int | None) -> dict[str, Any]:
         "evaluate_every": 10_000,
         "evaluation_episodes": 32 if env.is_jax else 10,
         "capacity": 5000 * (env.max_steps + 1),
-        "credit": {"sampled_steps": 24, "steps": 3200},
+        "credit": {"sampled_steps": 24, "batch_steps": 3200},
     }
 
 
