@@ -10,8 +10,9 @@ from lare_rl.credit import closed_form, decoder_state, evidence, learning, termi
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoder_state import CreditBatch
+from lare_rl.credit.factor_fit import assess_factors
 from lare_rl.credit.methods import METHODS
-from lare_rl.nn.normalise import RunningMeanStd
+from lare_rl.nn.normalise import RunningMeanStd, running_std
 from lare_rl.util.float64 import float64
 
 CAUSE, OUTCOME, CONSTANT = range(3)
@@ -66,6 +67,61 @@ def test_fit_pays_a_terminal_input_what_all_others_leave():
     assert weight[CAUSE] / state.network.std[CAUSE] == pytest.approx(3, rel=0.1)
 
 
+def test_fit_of_an_average_leaves_the_rest_to_a_terminal_input():
+    """R is fitted, not R/T."""
+    state, means, y = fit(np.full(N_EPISODES, 5), score="average")
+    weight, returns = np.asarray(state.network.weight), y * 5
+    first = np.stack([np.ones(N_EPISODES), means[:, CAUSE]], axis=1)
+    solution = np.linalg.lstsq(first, returns)[0]
+    second = np.stack([np.ones(N_EPISODES), means[:, OUTCOME]], axis=1)
+    _, slope = np.linalg.lstsq(second, returns - first @ solution)[0]
+    assert weight[CAUSE] == pytest.approx(solution[1], rel=0.01)
+    assert weight[OUTCOME] == pytest.approx(slope, rel=0.1)
+
+
+def test_an_end_that_is_always_the_same_is_told_from_the_start_value_by_the_evidence():
+    """A fall costs 20 at the end of each episode. Nothing else may be paid for it, such as the time, which goes with the length."""
+    rng = np.random.default_rng(0)
+    inputs, returns = [], []
+    for length in rng.integers(3, 30, 150):
+        rows = np.zeros((length, 1, 3), np.float32)
+        rows[:, 0, 0], rows[:, 0, 1], rows[-1, 0, 2] = rng.normal(size=length), np.arange(length) / 30, 1
+        inputs.append(rows)
+        returns.append(rows[:, 0, 0].sum() - 20 + 0.3 * rng.normal())
+    alive = [np.ones((len(rows), 1), bool) for rows in inputs]
+    basis = Basis(3, 0, extended=False)
+    explanation = assess_factors(inputs, alive, np.array(returns), basis, score="sum").explanation
+    assert explanation.terminal.tolist() == [False, False, True]
+    assert float(explanation.factors_r2) > 0.95
+    assert explanation.factor_shares[0] > 0.9
+    assert abs(explanation.slope[1]) < 0.05
+
+
+def test_rows_of_agents_that_did_not_act_do_not_count():
+    """The second agent's outcome varies before the end, where it does not act."""
+    lengths = np.full(20, 4)
+    rows, returns = sample(lengths)
+    rows = np.repeat(rows, 2, axis=1)
+    alive = np.ones(rows.shape[:2], bool)
+    rows[::4, 1, OUTCOME], alive[::4, 1] = 7.0, False
+    batch = CreditBatch(
+        inputs=jnp.asarray(rows),
+        episode_index=jnp.repeat(jnp.arange(20), 4),
+        length=jnp.asarray(lengths),
+        mean_reward=jnp.asarray(returns / 4),
+        mask=jnp.ones(20),
+        alive=jnp.asarray(alive),
+    )
+    spec = observation_spec(3, METHODS["rd-linear"], CreditSettings(), 4, agents=2)
+    state = decoder_state.init(jax.random.key(0), spec)
+    with float64():
+        closed = learning.add_to_sums(state.closed_form, batch)
+    assert float(closed.before_end.n_rows) == 20 * 3 * 2 - 20
+    assert running_std(closed.before_end).tolist()[1:] == [0, 0]
+    reset = closed_form.reset_statistics(closed, state.statistics)
+    assert float(reset.before_end.n_rows) == 0
+
+
 def test_fit_in_episodes_of_one_step_knows_no_end():
     state, _, _ = fit(np.ones(N_EPISODES, int))
     weight = np.asarray(state.network.weight) / np.where(state.network.std > 0, state.network.std, 1)
@@ -93,10 +149,10 @@ def test_reward_std_counts_terminal_inputs():
 @pytest.mark.parametrize(
     ("n_rows", "spread", "prefixes", "want"),
     [
-        (9, [0, 1], False, [True, False, True, True]),
-        (9, [1, 1], False, [False] * 4),
-        (0, [0, 0], False, [False] * 4),
-        (9, [0, 1], True, [False] * 4),
+        (terminal.MIN_STEPS, [0, 1], False, [True, False, True, True]),
+        (terminal.MIN_STEPS, [1, 1], False, [False] * 4),
+        (terminal.MIN_STEPS - 1, [0, 0], False, [False] * 4),
+        (terminal.MIN_STEPS, [0, 1], True, [False] * 4),
     ],
 )
 def test_terminal_columns(n_rows, spread, prefixes, want):

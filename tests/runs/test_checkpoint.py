@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from helpers.small_configs import small_config
 from lare_rl.errors import LareError
+from lare_rl.nn import normalise
 from lare_rl.runs import checkpoint
 from lare_rl.runs.best_policy import empty_best, save_best, update_best
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
@@ -156,14 +157,17 @@ def test_larger_replay_and_missing_arrays(tmp_path):
     class Closed(NamedTuple):
         strengths: Any
         weight: Any
+        before_end: Any = ()
 
     class State(NamedTuple):
         closed_form: Closed
 
-    state = State(Closed(Closed(jnp.ones(1), jnp.ones(3)), jnp.ones(2)))
+    before_end = normalise.empty_mean_std(2)
+    state = State(Closed(Closed(jnp.ones(1), jnp.ones(3)), jnp.ones(2), before_end))
     filled = checkpoint.fill_template(state, {".closed_form.weight": np.full(2, 5.0, np.float32)})
     assert filled.closed_form.weight.tolist() == [5, 5]
     assert filled.closed_form.strengths.weight.tolist() == [0, 0, 0]
+    assert all(normalise.running_std(filled.closed_form.before_end) > 0)  # no input is terminal
     with pytest.raises(ValueError, match="weight is missing"):
         checkpoint.fill_template(state, {})
 

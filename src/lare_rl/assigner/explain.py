@@ -49,5 +49,5 @@ def explain(learner: DecoderLearner) -> Explanation | None:
         state = compiled.init_explanation(decoder.statistics, basis=basis)
         for batch in whole_episodes(store, spec, list(store.episodes.values())):
             state = compiled.add_to_explanation(state, batch)
-        score_type, start_value = decoder.is_average.astype(int), decoder_state.start_value(decoder)
+        score_type, start_value = decoder.is_average.astype(int), decoder_state.explained_start_value(decoder)
         return jax.tree.map(np.asarray, compiled.explain(state, score_type, start_value))

@@ -186,25 +186,23 @@ class Basis:
         """Which features are functions of factors alone."""
         return np.arange(self.n_features) < self.n_factor_features
 
-    @property
-    def reads_input(self) -> Bool[np.ndarray, "features standardised"]:
-        """Which features are functions of which inputs, or of their history."""
-        inputs = np.eye(self.n_standardised, dtype=bool)
-        factors, raw = np.split(inputs, [self.n_factors])
-        tracked = np.tile(inputs[: self.n_tracked], (1 + 2 * self.history_frequencies, 1))
-        return np.concatenate(
+    def reads(self, inputs: Bool[Array, " standardised"]) -> Bool[Array, " features"]:
+        """Return which features are functions of at least one of some inputs, or of its history."""
+        factors, raw = inputs[: self.n_factors], inputs[self.n_factors : self.n_factors + self.n_raw_used]
+        tracked = jnp.tile(inputs[: self.n_tracked], 1 + 2 * self.history_frequencies)
+        return jnp.concatenate(
             [
-                np.tile(factors, (1 + 2 * self.factor_frequencies, 1)),
-                _either(factors) if self.extended else inputs[:0],
-                np.tile(raw[: self.n_raw_used], (1 + 2 * self.raw_frequencies, 1)),
-                _either(raw[: self.n_raw_paired]) if self.extended else inputs[:0],
+                jnp.tile(factors, 1 + 2 * self.factor_frequencies),
+                _reads_pairs(factors[: self.n_factors if self.extended else 0]),
+                jnp.tile(raw, 1 + 2 * self.raw_frequencies),
+                _reads_pairs(raw[: self.n_raw_paired if self.extended else 0]),
                 *[tracked] * N_EXTREMES,
             ]
         )
 
 
-def _either(inputs: Bool[np.ndarray, "n standardised"]) -> Bool[np.ndarray, "pairs standardised"]:
-    """Return which inputs the pair of two inputs reads, in the order of `pair_products`."""
+def _reads_pairs(inputs: Bool[Array, " n"]) -> Bool[Array, " pairs"]:
+    """Return which pairs have at least one of the inputs, in the order of `pair_products`."""
     i, j = np.triu_indices(len(inputs), 1)
     return inputs[i] | inputs[j]
 

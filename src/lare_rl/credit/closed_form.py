@@ -22,6 +22,8 @@ paid for c. In a fit of R/T, it is the weight of 1/T, and the evidence sets its 
 
 If returns are fitted to prefixes of episodes (`learning.py`), b is the weight of the number of steps, and the bias of the fit is V_0.
 
+Inputs that vary only in the last steps of episodes are fitted to the residual of all others (`terminal.py`).
+
 The features depend on the mean and the std that standardise x. If these changed with every step, the sums over earlier steps would
 be wrong, so they are kept constant until the number of steps has grown by a half. Then they are updated, and all stored episodes are
 summed again.
@@ -52,6 +54,7 @@ from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, running_std
 
 __all__ = [
     "ClosedForm",
+    "first_start_value",
     "fit",
     "fit_signs",
     "init",
@@ -86,10 +89,11 @@ class ClosedForm(NamedTuple):
     n_fitted: Float[Array, ""]
     """The number of episodes that the decoder is fitted to."""
     posterior: Posterior
-    """The fit with a precision for each group of features, of each score type but log odds, along a leading axis."""
+    """The fit with a precision for each group of features, of each score type but log odds, along a leading axis. The weights of terminal
+    inputs are 0."""
     strengths: Posterior
     """The fit with a precision of its own for each raw feature, and for its shapes (`relevance.py`), of the same score
-    types. A large precision switches a feature off. The decoder has the weights of the better fit."""
+    types. A large precision switches a feature off. The decoder has the weights of the better fit, and other ones for terminal inputs."""
     intercept: Float[Array, "score_types levels"]
     """The intercept of each level, for each score type: part of R/T for a sum that is not fitted to prefixes, else of R."""
     start_value: Float[Array, " score_types"]
@@ -222,7 +226,8 @@ def _add_terminal(
     def fit_score_type(args: tuple[Int[Array, ""], Posterior]) -> Posterior:
         score_type, first = args
         statistics = _score_type_statistics(state, score_type)
-        second = terminal.fit_residual(statistics, score_type, alpha_index, first.weight, columns, max_rounds)
+        rounds = jnp.where(has_terminal, max_rounds, 1)  # on a GPU, both branches of `cond` run
+        second = terminal.fit_residual(statistics, score_type, alpha_index, first.weight, columns, rounds)
         return first._replace(weight=jnp.where(columns, second.weight, first.weight), bias=second.bias)
 
     def fit_score_types(posterior: Posterior) -> Posterior:
@@ -249,6 +254,16 @@ def _start_value_unit(state: ClosedForm) -> Float[Array, ""]:
     """Return what the column 1/T is multiplied by, the inverse of its mean."""
     mean = evidence.to_float64(state.sufficient_statistics).mean[state.decoder.basis.n_features]
     return 1 / jnp.where(mean > 0, mean, 1)
+
+
+def first_start_value(state: ClosedForm) -> Float[Array, ""]:
+    """Return the start value of a sum by the fit without terminal inputs. Explanations of returns begin with it."""
+    basis = state.decoder.basis
+    if not basis.start_value:
+        return state.start_value[0]
+    best = relevance.select(state.strengths, state.posterior, basis.column_group_index, basis.column_strength_index)
+    first = (_start_value_unit(state) * best.weight[0, basis.n_features]).astype(jnp.float32)
+    return jnp.where(jnp.any(_terminal_columns(state)), first, state.start_value[0])
 
 
 def _linear_weights(basis: Basis, best: Posterior, start_value_unit: Float[Array, ""]) -> _Weights:
@@ -293,7 +308,8 @@ def reward_std(
 ) -> Float[Array, " rows"]:
     """Return the posterior standard deviation of r_hat, or of T r_hat if the score is an average.
 
-    Only after `fit`, not after `fit_signs`. `index` is the position of the score type among all that are fitted.
+    For terminal inputs it is approximate, because their precisions are taken from the fit without them. Only after `fit`, not after
+    `fit_signs`. `index` is the position of the score type among all that are fitted.
     """
     basis, features, n_linear = state.decoder.basis, state.decoder.features(rows), len(state.posterior.bias)
     linear_index = jnp.minimum(index, n_linear - 1)

@@ -42,6 +42,7 @@ __all__ = [
     "agent_mean",
     "decode",
     "decoder_rewards",
+    "explained_start_value",
     "init",
     "level_effects",
     "level_returns",
@@ -242,6 +243,13 @@ def start_value(state: DecoderState) -> Float[Array, ""]:
     if state.closed_form is None or state.closed_form.decoder.basis.prefixes:
         return jnp.zeros(())
     return jnp.where(state.is_average | state.is_log_odds, 0, state.closed_form.start_value[0])
+
+
+def explained_start_value(state: DecoderState) -> Float[Array, ""]:
+    """Return the start value that explanations subtract: that of the fit without terminal inputs."""
+    if state.closed_form is None or state.closed_form.decoder.basis.prefixes:
+        return jnp.zeros(())
+    return jnp.where(state.is_average | state.is_log_odds, 0, closed_form.first_start_value(state.closed_form))
 
 
 def level_effects(state: DecoderState, mean_length: float, n_levels: int) -> Float[Array, " levels"]:

@@ -162,7 +162,8 @@ def explain(
         mean_length=mean_length,
         explains_mean_reward=explains_mean_reward,
         total_r2=full.r2,
-        raw_feature_used=_is_used(full, basis) | (raw_shares > NOTICEABLE_SHARE),  # the latter also by its pairs
+        # The last two also by pairs, and as terminal inputs.
+        raw_feature_used=_is_used(full, basis) | (raw_shares > NOTICEABLE_SHARE) | columns[_raw_features(basis)],
         raw_feature_shares=raw_shares,
         residual_correlation=jnp.zeros(basis.n_raw_used),
     )
@@ -223,7 +224,7 @@ def _fit(
     second = terminal.fit_residual(statistics, score_type, group_index, posterior.weight, columns, rounds)
     posterior = posterior._replace(weight=jnp.where(columns, second.weight, posterior.weight))
     unexplained = _unexplained(problem, posterior)
-    unexplained = unexplained * jnp.where(jnp.any(columns), _unexplained(problem, second), 1)
+    unexplained = unexplained * jnp.where(jnp.any(columns) & second.has_fit, _unexplained(problem, second), 1)
     r2 = jnp.where((problem.dof > 1) & (problem.y_std > 0), 1 - unexplained, jnp.nan)
     weight = posterior.weight / jnp.where(problem.y_std > 0, problem.y_std, 1)
     covariance = problem.s @ weight
@@ -277,6 +278,11 @@ def _single_features(basis: Basis) -> Int[np.ndarray, "factors single"]:
     """Return the indices of the features of each factor alone, the linear one first."""
     n_single = 1 + 2 * basis.factor_frequencies
     return np.arange(basis.n_factors)[:, None] + basis.n_factors * np.arange(n_single)
+
+
+def _raw_features(basis: Basis) -> slice:
+    """Return the indices of the raw features themselves, without shapes and pairs."""
+    return slice(basis.n_factor_features, basis.n_factor_features + basis.n_raw_used)
 
 
 def _input_shares(
@@ -340,7 +346,7 @@ def _residual_correlation(problem: Regression, basis: Basis, posterior: Posterio
     weight = posterior.weight / jnp.where(problem.y_std > 0, problem.y_std, 1)
     weight = jnp.zeros(basis.n_features).at[:n_factor_features].set(weight)
     residual_variance = problem.q - 2 * weight @ problem.p + weight @ problem.s @ weight
-    raw = slice(n_factor_features, n_factor_features + basis.n_raw_used)
+    raw = _raw_features(basis)
     covariance = (problem.p - problem.s @ weight)[raw]
     size = jnp.sqrt(jnp.maximum(jnp.diagonal(problem.s)[raw] * residual_variance, 0))
     return jnp.where(size > 0, covariance / jnp.where(size > 0, size, 1), 0)

@@ -102,7 +102,7 @@ MESSAGES = {
     "equal_means": "its mean is the same in all episodes, so returns do not tell what it pays",
     "before_and_after": " (before: {before}; after: {after})",
     "depends_on_factor": " (its effect depends on another factor)",
-    "terminal": " (it varies only in the last step of an episode, so it is paid only for what the others leave unexplained)",
+    "terminal": " (it varies only in the last step of an episode: its share is of what the others leave unexplained)",
     "is_curved": " (its effect is curved)",
     "same_as": " (the same as {name}: their effects cannot be told apart; leave one of the two out of phi)",
     "about_states": (
@@ -316,7 +316,7 @@ def _factor(
         states = Finding("before_and_after", {"before": before, "after": after})
     shape = next((shape for i in varied if (shape := _effect_shape(explanation, i, names)) is not None), None)
     effect, per_unit = change or _effect(explanation, varied), None
-    if change is None and shape is None:
+    if change is None and (shape is None or shape.code == "terminal"):
         slope, std = effect.values["slope"], effect.values["std"]
         if abs(slope) < CLEAR_ERRORS * std and std > NEGLIGIBLE_FRACTION * np.abs(explanation.slope).max():
             effect = Finding("unclear_effect", effect.values)
@@ -335,11 +335,11 @@ def _effect(explanation: Explanation, indices: list[int]) -> Finding:
 
 def _effect_shape(explanation: Explanation, i: int, names: Sequence[str]) -> Finding | None:
     """Report a factor if it is terminal, if the reward does not simply rise or fall with it, or if another factor is the same."""
-    if explanation.terminal[i]:
-        return Finding("terminal")
     share, same = explanation.factor_shares[i], int(explanation.same_as[i])
     if same >= 0 and base_name(names[same]) != base_name(names[i]):
         return Finding("same_as", {"name": base_name(names[same])})
+    if explanation.terminal[i]:
+        return Finding("terminal")
     if share <= NOTICEABLE_SHARE:
         return None
     if explanation.pair_shares[i] > share / 2:

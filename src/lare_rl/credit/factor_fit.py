@@ -143,7 +143,7 @@ def predict_by_factors(
             if number >= N_FIRST and closed_form.is_due(state.closed_form):
                 state = _fit(state, spec)
     assert state.closed_form is not None
-    return state.score_type_predictions or state.predictions, float(state.closed_form.start_value[ScoreType.SUM])
+    return state.score_type_predictions or state.predictions, float(closed_form.first_start_value(state.closed_form))
 
 
 _predict_then_update = jax.jit(learning.predict_then_update, static_argnums=2)

@@ -7,7 +7,8 @@ there are two fits, the second one of the residual of the first:
     y_k               = b + w . m_k + noise         features of inputs that are not terminal
     y_k - b - w . m_k = b' + w' . m'_k + noise      features of terminal inputs
 
-Steps before the end are thus paid for their total effect on the return, and the last step for what is left.
+Steps before the end are thus paid for their total effect on the return, and the last step for what is left. If an environment pays several
+times, a stretch up to a payment takes the place of an episode.
 """
 
 import jax.numpy as jnp
@@ -22,19 +23,23 @@ from lare_rl.nn.normalise import RunningMeanStd, running_std
 __all__ = ["fit_residual", "keep_columns", "separate_columns", "terminal_columns"]
 
 
+MIN_STEPS = 10
+"""With fewer steps before the end of an episode, nothing is known of what varies there."""
+
+
 def terminal_columns(
     basis: Basis, statistics: SufficientStatistics, before_end: RunningMeanStd
 ) -> Bool[Array, " columns"]:
-    """Return which columns of a fit are features of terminal inputs. A pair is, if one of its inputs is.
+    """Return which columns of a fit are features of terminal inputs, and vary between episodes. A pair is, if one of its inputs is.
 
-    `before_end` is of all steps but the last ones. If there are no such steps, as in episodes of one step, no input is terminal. In a fit
-    to prefixes none is, because only the last prefix of an episode has its end.
+    `before_end` is of all steps but the last ones. If there are fewer than `MIN_STEPS` of them, as in episodes of one step, no input is
+    terminal. In a fit to prefixes none is, because only the last prefix of an episode has its end.
     """
     n_columns, n_steps = basis.n_columns, jnp.maximum(statistics.n_steps, 1)
     if basis.prefixes:
         return jnp.zeros(n_columns, bool)
-    is_constant = (before_end.n_rows > 0) & (running_std(before_end) == 0)
-    features = jnp.any(basis.reads_input & is_constant, axis=1)
+    is_constant = (before_end.n_rows >= MIN_STEPS) & (running_std(before_end) == 0)
+    features = basis.reads(is_constant)
     squares = jnp.diagonal(statistics.products)[:n_columns]
     return jnp.pad(features, (0, n_columns - basis.n_features)) & varies(
         squares / n_steps, statistics.mean[:n_columns] ** 2
@@ -60,7 +65,7 @@ def fit_residual(
     alpha_index: AlphaIndex,
     weight: Float[Array, " columns"],
     columns: Bool[Array, " columns"],
-    max_rounds: int,
+    max_rounds: int | Int[Array, ""],
 ) -> Posterior:
     """Fit some columns to what the other columns leave unexplained by their weights of an earlier fit.
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lare_rl.config.train_config import TrainConfig
-from lare_rl.credit.decoder_state import CreditBatch, start_value, valid_rows
+from lare_rl.credit.decoder_state import CreditBatch, explained_start_value, valid_rows
 from lare_rl.credit.explanation import Explanation, add_to_explanation, explain, init_explanation
 from lare_rl.credit.explanation_text import LEGEND_CODES, MESSAGES, MIN_EXPLAINED_EPISODES, returns_findings
 from lare_rl.credit.methods import FACTORS_ALONE, METHODS, Method
@@ -140,7 +140,7 @@ _ScoreFacts = tuple[tuple[Bool[Array, " seeds"], Float[Array, " seeds"]], ...]
 
 
 def _score_facts(learner: Learner) -> _ScoreFacts:
-    return tuple((decoder.is_average, jax.vmap(start_value)(decoder)) for decoder in learner.decoders)
+    return tuple((decoder.is_average, jax.vmap(explained_start_value)(decoder)) for decoder in learner.decoders)
 
 
 def _explain_first_seed(replay: Replay, score_facts: _ScoreFacts, config: TrainConfig) -> list[Explanation]:
