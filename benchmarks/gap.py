@@ -38,11 +38,7 @@ def best_raw(comparison: Comparison) -> str:
 
 
 def method_runs(comparison: Comparison) -> dict[str, Sources]:
-    return {
-        RAW: comparison.raw[best_raw(comparison)] if comparison.raw else (),
-        PAPER: comparison.paper,
-        DEFAULT: comparison.default,
-    }
+    return {RAW: comparison.raw[best_raw(comparison)], PAPER: comparison.paper, DEFAULT: comparison.default}
 
 
 def cell(sources: Sources, comparison: Comparison) -> str:
@@ -173,8 +169,7 @@ def print_table(comparisons: Mapping[str, Comparison]) -> None:
     for name, comparison in comparisons.items():
         cells = [f"{name}, {comparison.steps:,}"]
         runs = method_runs(comparison)
-        raw = f"{cell(runs[RAW], comparison)}, `{best_raw(comparison)}`" if runs[RAW] else "-"
-        cells += [cell(comparison.episodic, comparison), raw]
+        cells += [cell(comparison.episodic, comparison), f"{cell(runs[RAW], comparison)}, `{best_raw(comparison)}`"]
         columns = comparison.without_phi, runs[PAPER], runs[DEFAULT], comparison.dense
         cells += [cell(sources, comparison) for sources in columns]
         print(f"| {' | '.join(cells)} |")
@@ -187,26 +182,19 @@ def main() -> None:
     print_table(THREE_SEEDS)
     with_gap = {name: comparison for name, comparison in COMPARISONS.items() if has_gap(comparison)}
     rows = {
-        f"{name}\n{comparison.steps:,} steps": {
-            method: estimate_share([comparison], method) for method in METHODS if method_runs(comparison)[method]
-        }
+        f"{name}\n{comparison.steps:,} steps": {method: estimate_share([comparison], method) for method in METHODS}
         for name, comparison in with_gap.items()
     }
-    complete = [comparison for comparison in with_gap.values() if comparison.raw]
-    label = f"interquartile mean\nof {len(complete)} tasks, 10 seeds each"
-    rows[label] = {method: estimate_share(complete, method) for method in METHODS}
+    tasks = list(with_gap.values())
+    label = f"interquartile mean\nof {len(tasks)} tasks, 10 seeds each"
+    rows[label] = {method: estimate_share(tasks, method) for method in METHODS}
     for name, estimates in rows.items():
         texts = [f"{method} {value:.2f} [{low:.2f}, {high:.2f}]" for method, (value, low, high) in estimates.items()]
         print(name.replace("\n", ", "), "; ".join(texts), sep=": ")
     for other in (PAPER, RAW):
-        value, low, high = estimate_difference(complete, DEFAULT, other)
+        value, low, high = estimate_difference(tasks, DEFAULT, other)
         print(f"{DEFAULT} above {other}: {value:.2f} [{low:.2f}, {high:.2f}]")
-    tasks = list(with_gap.values())
-    estimates = {method: estimate_share(tasks, method) for method in (PAPER, DEFAULT)}
-    estimates["difference"] = estimate_difference(tasks, DEFAULT, PAPER)
-    texts = [f"{name} {value:.2f} [{low:.2f}, {high:.2f}]" for name, (value, low, high) in estimates.items()]
-    print(f"all {len(tasks)} tasks: {'; '.join(texts)}")
-    means = [f"{method} {np.mean(seed_shares(read_samples(complete, method))):.2f}" for method in METHODS]
+    means = [f"{method} {np.mean(seed_shares(read_samples(tasks, method))):.2f}" for method in METHODS]
     print(f"mean of these tasks: {'; '.join(means)}")
     PICTURE.write_text(draw(rows) + "\n", encoding="utf-8")
 

@@ -89,20 +89,22 @@ def simulator(task: str, algorithm: str, steps: int, episodic: str = "", dense: 
     )
 
 
-def sweep(study: str, task: str, *raw: str) -> Comparison:
-    """A task of a sweep of 30,000 steps, and its candidates for the best decoder of raw features."""
+def sweep(
+    study: str, task: str, *raw: str, algorithm: str = "td3", steps: int = 30_000, paper: str = "lare-rrdu"
+) -> Comparison:
+    """A task of a sweep, and its candidates for the best decoder of raw features."""
 
     def runs(method: str) -> Sources:
-        return [f"sweeps/{study}/{task}/{method}"]
+        return [f"sweeps/{study}/{task}/{method}-{algorithm}{'-draw0' if method.startswith('lare-') else ''}"]
 
     return Comparison(
-        30_000,
-        runs("episodic-td3"),
-        runs("dense-td3"),
-        {method: runs(f"{method}-td3") for method in raw},
-        runs("lare-rrdu-td3-draw0"),
-        runs("lare-bayes-td3-draw0"),
-        runs("bayes-td3"),
+        steps,
+        runs("episodic"),
+        runs("dense"),
+        {method: runs(method) for method in raw},
+        runs(paper),
+        runs("lare-bayes"),
+        runs("bayes"),
     )
 
 
@@ -120,22 +122,6 @@ def score_study(sources: str, steps: int, *raw: str, paper: str = "lare-rrdu", w
         labelled(paper),
         labelled("lare-bayes"),
         labelled("bayes") if without_phi else (),
-    )
-
-
-def starcraft(task: str) -> Comparison:
-    """A battle with QMIX. No decoder of raw features was trained."""
-
-    def runs(method: str) -> Sources:
-        return [f"sweeps/headline-starcraft/{task}/{method}"]
-
-    return Comparison(
-        200_000,
-        runs("episodic-qmix"),
-        runs("dense-qmix"),
-        paper=runs("lare-rd-qmix-draw0"),
-        default=runs("lare-bayes-qmix-draw0"),
-        without_phi=runs("bayes-qmix"),
     )
 
 
@@ -159,7 +145,9 @@ COMPARISONS = {
     ),
     "PP-6, IPPO": score_study("scores_published.json:PP-6, late:", 205_000, "rrdu", "lrr", paper="lare-rd"),
     "CN-6, IPPO": score_study("scores_published.json:CN-6, late:", 205_000, "rrdu", "lrr", paper="lare-rd"),
-    "SMAX-2s3z, QMIX": starcraft("SMAX-2s3z"),
+    "SMAX-2s3z, QMIX": sweep(
+        "headline-starcraft", "SMAX-2s3z", "rrdu", algorithm="qmix", steps=200_000, paper="lare-rd"
+    ),
 }
 """Ten seeds for each method."""
 
