@@ -226,7 +226,7 @@ def _add_terminal(
     def fit_score_type(args: tuple[Int[Array, ""], Posterior]) -> Posterior:
         score_type, first = args
         statistics = _score_type_statistics(state, score_type)
-        rounds = jnp.where(has_terminal, max_rounds, 1)  # on a GPU, both branches of `cond` run
+        rounds = jnp.where(has_terminal, max_rounds, 1)  # if `vectorized`, both branches of `cond` run
         second = terminal.fit_residual(statistics, score_type, alpha_index, first.weight, columns, rounds)
         return first._replace(weight=jnp.where(columns, second.weight, first.weight), bias=second.bias)
 
