@@ -320,7 +320,7 @@ def small_runs(monkeypatch):
 
     def resolve_small(settings, task):
         resolved = resolve(settings, task)
-        credit = resolved.credit.model_copy(update={"hidden": (8,), "sampled_steps": 4, "steps": 16})
+        credit = resolved.credit.model_copy(update={"hidden": (8,), "sampled_steps": 4, "batch_steps": 16})
         fields = type(resolved.hyperparameters).model_fields
         small = {"hidden": 8 if resolved.algorithm in ("qmix", "vdn") else (8,), "batch_size": 8, "epochs": 1}
         small = resolved.hyperparameters.model_copy(update={name: small[name] for name in small if name in fields})

@@ -8,7 +8,7 @@ from helpers.toy_envs import toy_spec
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.credit.decoder_settings import CreditSettings
 
-SMALL_CREDIT = CreditSettings(hidden=(8,), sampled_steps=4, steps=16, episodes=2, score="sum")
+SMALL_CREDIT = CreditSettings(hidden=(8,), sampled_steps=4, batch_steps=16, batch_episodes=2, score="sum")
 """Nothing is fitted to find out the type of the score, which takes seconds to compile."""
 ANY_SCORE = SMALL_CREDIT.model_copy(update={"score": "auto"})
 TASK = toy_spec()

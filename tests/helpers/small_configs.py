@@ -44,7 +44,7 @@ SMALL_SETTINGS = {
 }
 
 
-SUM_CREDIT = CreditSettings(hidden=(8,), sampled_steps=4, steps=24, score="sum")
+SUM_CREDIT = CreditSettings(hidden=(8,), sampled_steps=4, batch_steps=24, score="sum")
 """Nothing is fitted to find out the type of the score, which takes seconds to compile."""
 ANY_SCORE = SUM_CREDIT.model_copy(update={"score": "auto"})
 

@@ -12,7 +12,7 @@ from helpers.toy_envs import toy_spec
 from lare_rl.runs.directory import open_run
 from lare_rl.training.train import RunInterruptedError
 
-QUICK_CREDIT = {"hidden": (8,), "sampled_steps": 4, "steps": 16, "score": "sum"}
+QUICK_CREDIT = {"hidden": (8,), "sampled_steps": 4, "batch_steps": 16, "score": "sum"}
 """To find out the type of the score would take seconds of compilation."""
 
 CHASE = toy_spec(measures=("distance",))
