@@ -44,7 +44,7 @@ def stack_seeds(*seeds):
 def test_update_in_chunks_is_that_of_the_batch(monkeypatch):
     """Six episodes of twelve steps, in three chunks of two episodes."""
     env = replace(ONE_AGENT, fixed_length=True)
-    config = small_config("rd", env=env, credit=CreditSettings(hidden=(8,), steps=72, learning_rate=0.1))
+    config = small_config("rd", env=env, credit=CreditSettings(hidden=(8,), batch_steps=72, learning_rate=0.1))
     learner = add_steps(untrained_learner(config), config, random_steps(env, lengths=(12,) * 8))
     sample = jax.tree.map(lambda leaf: leaf[0], sample_credit(learner.replay, jax.random.key(0), 1, config))
     assert sample.episodes.length.shape == (6,)

@@ -26,7 +26,7 @@ from lare_rl.training.rewards import rewards
 
 
 def test_train_step_relabels_by_the_newest_decoder():
-    credit = CreditSettings(hidden=(8,), sampled_steps=4, steps=24, learning_rate=0.3, score="sum")
+    credit = CreditSettings(hidden=(8,), sampled_steps=4, batch_steps=24, learning_rate=0.3, score="sum")
     config = small_config("lare-rrdu", rollout_steps=1, credit=credit)
     learner = learner_with_episodes(config)
     updated, metrics = jitted(off_policy.train_step, config)(learner, random_steps(), jax.random.key(0), jnp.array(0))

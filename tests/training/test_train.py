@@ -218,7 +218,7 @@ def test_toy_is_learned(task, algorithm, method, steps, hyperparameters, least, 
         **{algorithm: ALGORITHMS[algorithm].settings.model_copy(update=hyperparameters)},
         **({"capacity": 380} if algorithm == "ddpg" else {}),  # with fewer than 20 episodes, no explanation is compiled
         **values,
-        credit=CreditSettings(hidden=(32,), learning_rate=3e-3, sampled_steps=8, steps=64, score="sum"),
+        credit=CreditSettings(hidden=(32,), learning_rate=3e-3, sampled_steps=8, batch_steps=64, score="sum"),
     )
     source = PICK_PHI if task == pick_spec() else PHI
     function = verify_function(source, task) if METHODS[method].needs_phi else None
