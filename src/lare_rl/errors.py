@@ -80,11 +80,11 @@ def short_repr(value: Any) -> str:
 
 
 def did_you_mean(name: str, known_names: Iterable[str]) -> str:
-    """Return a hint at a known name: one that ends with ".NAME", else the closest, else one that contains it. Empty if none does."""
+    """Return a hint at a known name: one that ends with ".NAME", the closest, or the shortest that contains it. Empty if none does."""
     names = list(known_names)
     suffixed = [other for other in names if other.endswith(f".{name.lstrip('-')}")]
     containing = [other for other in names if len(name) > 2 and name.lower() in other.lower()]
-    close = suffixed[:1] or difflib.get_close_matches(name, names, n=1, cutoff=0.65) or containing[:1]
+    close = suffixed[:1] or difflib.get_close_matches(name, names, n=1, cutoff=0.65) or sorted(containing, key=len)[:1]
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 

@@ -29,7 +29,7 @@ def test_settings_complete_hyperparameters_from_the_algorithm(name):
 @pytest.mark.parametrize(
     ("settings", "texts"),
     [
-        ({"credit": {"sampled_step": 8}}, ["'credit.sampled_step'", "'sampled_steps'"]),
+        ({"credit": {"step": 800}}, ["'credit.step'", "'batch_steps'"]),
         ({"credit": {"sampled_steps": 1}}, ["credit.sampled_steps = 1"]),
         ({"credit": {"hidden": (0,)}}, ["credit.hidden", "0"]),
         ({"gamma": 0.9}, ["'gamma'", "'td3.gamma'"]),

@@ -34,6 +34,7 @@ sum of two float32 numbers. Call all functions of this module that read or chang
 """
 
 import itertools
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -173,9 +174,7 @@ def fit(
     """
     basis = state.decoder.basis
     linear_types = tuple(score_type for score_type in score_types if score_type != ScoreType.LOG_ODDS)
-    groups, strengths = _fit_linear_types(state, linear_types, max_rounds, vectorized=vectorized)
-    best = relevance.select(strengths, groups, basis.column_group_index, basis.column_strength_index)
-    best = _add_terminal(state, linear_types, best, max_rounds, vectorized=vectorized)
+    groups, strengths, best = _fit_linear_types(state, linear_types, max_rounds, vectorized=vectorized)
     weights = _linear_weights(basis, best, _start_value_unit(state))
     if ScoreType.AVERAGE in score_types and not fixed_length:
         weights = _centre_average(state, weights, score_types.index(ScoreType.AVERAGE))
@@ -192,15 +191,20 @@ def fit(
 
 def _fit_linear_types(
     state: ClosedForm, score_types: tuple[int, ...], max_rounds: int, *, vectorized: bool
-) -> tuple[Posterior, Posterior]:
-    """Return the fits by groups and by strengths of sum and average, along a leading axis."""
-    indices = state.decoder.basis.column_group_index, state.decoder.basis.column_strength_index
+) -> tuple[Posterior, Posterior, Posterior]:
+    """Return the fits of sum and average without terminal inputs, by groups and by strengths, and the better one with them."""
+    basis, columns = state.decoder.basis, _terminal_columns(state)
+    indices = basis.column_group_index, basis.column_strength_index
 
-    def fit_score_type(args: tuple[Int[Array, ""], Posterior, Posterior]) -> tuple[Posterior, Posterior]:
+    def fit_score_type(args: tuple[Int[Array, ""], Posterior, Posterior]) -> tuple[Posterior, Posterior, Posterior]:
         score_type, *earlier = args
         groups, strengths = jax.tree.map(lambda leaf: leaf.astype(float), earlier)
-        statistics = terminal.keep_columns(_score_type_statistics(state, score_type), ~_terminal_columns(state))
-        return relevance.fit(statistics, score_type, *indices, groups, strengths, max_rounds, vectorized=vectorized)
+        statistics = _score_type_statistics(state, score_type)
+        first = terminal.keep_columns(statistics, ~columns)
+        fits = relevance.fit(first, score_type, *indices, groups, strengths, max_rounds, vectorized=vectorized)
+        add_terminal = partial(_add_terminal, statistics, score_type, basis, columns, max_rounds)
+        best = jax.lax.cond(jnp.any(columns), add_terminal, lambda unchanged: unchanged, _better_fit(basis, *fits))
+        return *fits, best
 
     rows = jnp.asarray(score_types), state.posterior, state.strengths
     return map_leading_axis(fit_score_type, rows, vectorized=vectorized)
@@ -211,29 +215,27 @@ def _terminal_columns(state: ClosedForm) -> Bool[Array, " columns"]:
     return terminal.terminal_columns(state.decoder.basis, statistics, state.before_end)
 
 
+def _better_fit(basis: Basis, groups: Posterior, strengths: Posterior) -> Posterior:
+    return relevance.select(strengths, groups, basis.column_group_index, basis.column_strength_index)
+
+
 def _add_terminal(
-    state: ClosedForm, score_types: tuple[int, ...], posterior: Posterior, max_rounds: int, *, vectorized: bool
+    statistics: SufficientStatistics,
+    score_type: Int[Array, ""],
+    basis: Basis,
+    columns: Bool[Array, " columns"],
+    max_rounds: int,
+    first: Posterior,
 ) -> Posterior:
-    """Return the fits with the weights of terminal inputs, which are 0 before. The start value is fitted again with them.
+    """Return a fit with the weights of terminal inputs, which are 0 before. The start value is fitted again with them.
 
     A terminal input that is the same in all episodes, such as the fall that ends each of them, has the mean 1/T.
     """
-    basis, columns = state.decoder.basis, _terminal_columns(state)
-    has_terminal, alpha_index = jnp.any(columns), basis.column_group_index
+    rounds = jnp.where(jnp.any(columns), max_rounds, 1)  # if `vectorized`, both branches of `cond` run
     if basis.start_value:
         columns = columns.at[basis.n_features].set(True)
-
-    def fit_score_type(args: tuple[Int[Array, ""], Posterior]) -> Posterior:
-        score_type, first = args
-        statistics = _score_type_statistics(state, score_type)
-        rounds = jnp.where(has_terminal, max_rounds, 1)  # if `vectorized`, both branches of `cond` run
-        second = terminal.fit_residual(statistics, score_type, alpha_index, first.weight, columns, rounds)
-        return first._replace(weight=jnp.where(columns, second.weight, first.weight), bias=second.bias)
-
-    def fit_score_types(posterior: Posterior) -> Posterior:
-        return map_leading_axis(fit_score_type, (jnp.asarray(score_types), posterior), vectorized=vectorized)
-
-    return jax.lax.cond(has_terminal, fit_score_types, lambda unchanged: unchanged, posterior)
+    both = terminal.fit_residual(statistics, score_type, basis.column_group_index, first.weight, columns, rounds)
+    return first._replace(weight=both.weight, bias=both.bias)
 
 
 def _score_type_statistics(state: ClosedForm, score_type: Int[Array, ""] | int) -> SufficientStatistics:
@@ -261,7 +263,7 @@ def first_start_value(state: ClosedForm) -> Float[Array, ""]:
     basis = state.decoder.basis
     if not basis.start_value:
         return state.start_value[0]
-    best = relevance.select(state.strengths, state.posterior, basis.column_group_index, basis.column_strength_index)
+    best = _better_fit(basis, state.posterior, state.strengths)
     first = (_start_value_unit(state) * best.weight[0, basis.n_features]).astype(jnp.float32)
     return jnp.where(jnp.any(_terminal_columns(state)), first, state.start_value[0])
 
@@ -313,10 +315,9 @@ def reward_std(
     """
     basis, features, n_linear = state.decoder.basis, state.decoder.features(rows), len(state.posterior.bias)
     linear_index = jnp.minimum(index, n_linear - 1)
-    best = relevance.select(state.strengths, state.posterior, basis.column_group_index, basis.column_strength_index)
-    score_type, columns = jnp.asarray(score_types)[linear_index], _terminal_columns(state)
+    best, score_type = _better_fit(basis, state.posterior, state.strengths), jnp.asarray(score_types)[linear_index]
     covariance = evidence.posterior_covariance(
-        terminal.separate_columns(_score_type_statistics(state, score_type), columns),
+        terminal.separate_columns(_score_type_statistics(state, score_type), _terminal_columns(state)),
         score_type,
         basis.column_strength_index,
         jax.tree.map(lambda leaf: leaf[linear_index].astype(float), best),
@@ -327,9 +328,7 @@ def reward_std(
     std = evidence.posterior_std(covariance, features)
     if state.log_odds is None:
         return std
-    log_odds = logistic.covariance(state.log_odds)
-    log_odds = log_odds._replace(root=jnp.where(columns, 0, log_odds.root))  # terminal inputs are not paid
-    log_odds_std = evidence.posterior_std(log_odds, features)
+    log_odds_std = evidence.posterior_std(logistic.covariance(state.log_odds), features)
     return jnp.where(index == n_linear, log_odds_std, std)
 
 

@@ -13,7 +13,7 @@ Inputs and targets are normalised by statistics in the state. Scaling the return
 r_hat. `normalise = false` is the published form, with raw features and raw targets.
 """
 
-import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -196,9 +196,7 @@ def observe_steps(
     Steps where `mask` is false are ignored.
     """
     n_standardised = len(state.statistics.mean)  # a history has no statistics of its own
-    rows = inputs[..., :n_standardised].reshape(math.prod(inputs.shape[:-1]), n_standardised)
-    mask = None if mask is None else mask.ravel()
-    return state._replace(statistics=normalise.update_mean_std(state.statistics, rows, mask))
+    return state._replace(statistics=normalise.update_mean_std(state.statistics, inputs[..., :n_standardised], mask))
 
 
 def observe_returns(
@@ -240,16 +238,20 @@ def level_returns(
 
 def start_value(state: DecoderState) -> Float[Array, ""]:
     """Return the start value of a score that is a sum, or 0. A fit of prefixes has V_0 instead, which is not the start value of R."""
-    if state.closed_form is None or state.closed_form.decoder.basis.prefixes:
-        return jnp.zeros(())
-    return jnp.where(state.is_average | state.is_log_odds, 0, state.closed_form.start_value[0])
+    return _value_of_sum(state, lambda closed: closed.start_value[0])
 
 
 def explained_start_value(state: DecoderState) -> Float[Array, ""]:
     """Return the start value that explanations subtract: that of the fit without terminal inputs."""
-    if state.closed_form is None or state.closed_form.decoder.basis.prefixes:
+    return _value_of_sum(state, closed_form.first_start_value)
+
+
+def _value_of_sum(state: DecoderState, value: Callable[[ClosedForm], Float[Array, ""]]) -> Float[Array, ""]:
+    """Return a number of the closed form, or 0 if it has prefixes or the score is no sum."""
+    closed = state.closed_form
+    if closed is None or closed.decoder.basis.prefixes:
         return jnp.zeros(())
-    return jnp.where(state.is_average | state.is_log_odds, 0, closed_form.first_start_value(state.closed_form))
+    return jnp.where(state.is_average | state.is_log_odds, 0, value(closed))
 
 
 def level_effects(state: DecoderState, mean_length: float, n_levels: int) -> Float[Array, " levels"]:

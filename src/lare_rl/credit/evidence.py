@@ -59,6 +59,7 @@ __all__ = [
     "split_double",
     "starting_precisions",
     "to_float64",
+    "transform",
     "unscale",
 ]
 
@@ -105,6 +106,14 @@ def split_double(statistics: SufficientStatistics) -> SufficientStatistics:
 def to_float64(statistics: SufficientStatistics) -> SufficientStatistics:
     """Invert `split_double`, in float64 if that is enabled."""
     return jax.tree.map(lambda number: jnp.sum(number.astype(float), axis=0), statistics)
+
+
+def transform(
+    statistics: SufficientStatistics, matrix: Float[Array, "new features_and_targets"]
+) -> SufficientStatistics:
+    """Return the sums of the cases A v_k, where A is a matrix."""
+    products = matrix @ statistics.products @ matrix.T
+    return statistics._replace(mean=matrix @ statistics.mean, products=products)
 
 
 def add_episodes(

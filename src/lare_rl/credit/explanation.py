@@ -162,7 +162,7 @@ def explain(
         mean_length=mean_length,
         explains_mean_reward=explains_mean_reward,
         total_r2=full.r2,
-        # The last two also by pairs, and as terminal inputs.
+        # A share counts pairs too, and the strengths do not know terminal inputs.
         raw_feature_used=_is_used(full, basis) | (raw_shares > NOTICEABLE_SHARE) | columns[_raw_features(basis)],
         raw_feature_shares=raw_shares,
         residual_correlation=jnp.zeros(basis.n_raw_used),
@@ -220,10 +220,10 @@ def _fit(
     start, earlier = map(evidence.init_posterior, indices)
     not_terminal, rounds = terminal.keep_columns(statistics, ~columns), MAX_EXPLANATION_ROUNDS
     groups, strengths = relevance.fit(not_terminal, score_type, *indices, start, earlier, rounds)
-    posterior = relevance.select(strengths, groups, *indices)
-    second = terminal.fit_residual(statistics, score_type, group_index, posterior.weight, columns, rounds)
-    posterior = posterior._replace(weight=jnp.where(columns, second.weight, posterior.weight))
-    unexplained = _unexplained(problem, posterior)
+    first = relevance.select(strengths, groups, *indices)
+    second = terminal.fit_residual(statistics, score_type, group_index, first.weight, columns, rounds)
+    posterior = first._replace(weight=second.weight)
+    unexplained = _unexplained(problem, first)
     unexplained = unexplained * jnp.where(jnp.any(columns) & second.has_fit, _unexplained(problem, second), 1)
     r2 = jnp.where((problem.dof > 1) & (problem.y_std > 0), 1 - unexplained, jnp.nan)
     weight = posterior.weight / jnp.where(problem.y_std > 0, problem.y_std, 1)
@@ -262,9 +262,8 @@ def _subtract(
     statistics: SufficientStatistics, column: int, start_value: Float[Array, ""] | float
 ) -> SufficientStatistics:
     """Return the sums with R/T - c/T in place of R/T, and without 1/T, which is this column."""
-    transform = np.delete(np.eye(len(statistics.mean)), column, axis=0)
-    transform = jnp.asarray(transform).at[-2, column].set(-start_value)
-    return statistics._replace(mean=transform @ statistics.mean, products=transform @ statistics.products @ transform.T)
+    matrix = np.delete(np.eye(len(statistics.mean)), column, axis=0)
+    return evidence.transform(statistics, jnp.asarray(matrix).at[-2, column].set(-start_value))
 
 
 def _select(statistics: SufficientStatistics, features: Int[np.ndarray, " selected"]) -> SufficientStatistics:

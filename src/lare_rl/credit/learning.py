@@ -189,7 +189,7 @@ def _add_before_end(before_end: RunningMeanStd, episodes: CreditBatch) -> Runnin
     is_last = jnp.append(index[1:] != index[:-1], True)
     valid = decoder_state.valid_rows(episodes)
     mask = valid & ~is_last.reshape(-1, *[1] * (valid.ndim - 1))
-    return normalise.update_mean_std(before_end, episodes.inputs[..., :n_inputs].reshape(-1, n_inputs), mask.ravel())
+    return normalise.update_mean_std(before_end, episodes.inputs[..., :n_inputs], mask)
 
 
 def add_to_log_odds(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:

@@ -121,7 +121,7 @@ def fit(
 ) -> LogOddsFit:
     """Fit to the episodes, from the precisions of the last fit. Call this with float64 enabled.
 
-    Only columns where `is_kept` is true have weights that are not 0.
+    Only columns where `is_kept` is true have weights and a covariance that are not 0.
 
     Returns are divided into won and lost halfway between the lowest and the highest. While all episodes are won, or all are lost, or all
     returns are equal but for rounding errors, nothing changes.
@@ -176,7 +176,7 @@ def fit(
     initial = (jnp.array(0), jnp.array(jnp.inf), jnp.ones(WINDOW), start, state.root)
     initial = jax.tree.map(lambda leaf: leaf.astype(float) if leaf.dtype == jnp.float32 else leaf, initial)
     *_, posterior, root = jax.lax.while_loop(is_unsettled, body, initial)
-    fitted = state._replace(posterior=posterior, root=root)
+    fitted = state._replace(posterior=posterior, root=jnp.where(is_kept, root, 0))
     return jax.tree.map(lambda new, old: jnp.where(is_mixed, new, old).astype(old.dtype), fitted, state)
 
 

@@ -1,8 +1,9 @@
-"""Terminal inputs: those that vary only in the last steps of episodes, such as a factor that is 1 if the episode was won.
+"""The regression of terminal inputs.
 
-A regression on all features at once (`evidence.py`) gives each feature its direct effect. A terminal input says how the episode ended, so
-it explains the return almost alone, and the steps that led to this end get little credit: the credit stays where the score is paid. So
-there are two fits, the second one of the residual of the first:
+A terminal input varies only in the last steps of episodes. An example is a factor that is 1 if the episode was won. A regression on all
+features at once (`evidence.py`) gives each feature its direct effect. A terminal input says how the episode ended, so it explains the
+return almost alone, and the steps that led to this end get little credit: the credit stays where the score is paid. So there are two
+fits, the second one of the residual of the first:
 
     y_k               = b + w . m_k + noise         features of inputs that are not terminal
     y_k - b - w . m_k = b' + w' . m'_k + noise      features of terminal inputs
@@ -21,7 +22,6 @@ from lare_rl.credit.precisions import AlphaIndex, Posterior, varies
 from lare_rl.nn.normalise import RunningMeanStd, running_std
 
 __all__ = ["fit_residual", "keep_columns", "separate_columns", "terminal_columns"]
-
 
 MIN_STEPS = 10
 """With fewer steps before the end of an episode, nothing is known of what varies there."""
@@ -69,12 +69,10 @@ def fit_residual(
 ) -> Posterior:
     """Fit some columns to what the other columns leave unexplained by their weights of an earlier fit.
 
-    The bias of the result is that of both fits together.
+    The weights and the bias of the result are those of both fits together, all else is of the second fit.
     """
-    n_columns = len(alpha_index)
-    transform = jnp.eye(n_columns + 2).at[n_columns + score_type, :n_columns].set(-jnp.where(columns, 0, weight))
-    residual = statistics._replace(
-        mean=transform @ statistics.mean, products=transform @ statistics.products @ transform.T
-    )
-    start = evidence.init_posterior(alpha_index)
-    return evidence.fit(keep_columns(residual, columns), score_type, alpha_index, start, max_rounds)
+    n_columns, start = len(alpha_index), evidence.init_posterior(alpha_index)
+    matrix = jnp.eye(n_columns + 2).at[n_columns + score_type, :n_columns].set(-jnp.where(columns, 0, weight))
+    residual = keep_columns(evidence.transform(statistics, matrix), columns)
+    second = evidence.fit(residual, score_type, alpha_index, start, max_rounds)
+    return second._replace(weight=jnp.where(columns, second.weight, weight))

@@ -1,5 +1,6 @@
 """Running statistics, by which features and returns are normalised."""
 
+import math
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -42,9 +43,11 @@ def empty_mean_std(n_features: int) -> RunningMeanStd:
 
 
 def update_mean_std(
-    statistics: RunningMeanStd, rows: Float[Array, "batch features"], mask: Bool[Array, " batch"] | None = None
+    statistics: RunningMeanStd, rows: Float[Array, "*batch features"], mask: Bool[Array, "*batch"] | None = None
 ) -> RunningMeanStd:
     """Add a batch of rows. Rows where `mask` is false are ignored."""
+    rows = rows.reshape(math.prod(rows.shape[:-1]), rows.shape[-1])
+    mask = None if mask is None else mask.ravel()
     n_new, where = (len(rows), None) if mask is None else (jnp.sum(mask), mask[:, None])
     mean = jnp.sum(rows, axis=0, where=where) / jnp.maximum(n_new, 1)
     batch_squares = jnp.sum((rows - mean) ** 2, axis=0, where=where)

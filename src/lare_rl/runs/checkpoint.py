@@ -36,15 +36,14 @@ REPLAY = ".replay."
 """The path of the replay within the state."""
 SAVED_BY_ROW = f"{REPLAY}columns"
 """The path of the arrays that are saved by row."""
-ZERO_IF_MISSING = (
-    *(".closed_form.strengths.", ".closed_form.intercept", ".closed_form.start_value"),
-    ".target_scale",
-    *(".log_odds.lowest", ".log_odds.highest"),
-    *(".is_log_odds", ".is_average", ".predictions.level", ".score_type_predictions.level"),
-)
-"""Paths of arrays that earlier checkpoints do not have. Zeros mean that they have not been computed yet, or make no difference."""
-ONE_IF_MISSING = ".closed_form.before_end."
-"""The path of arrays that earlier checkpoints do not have. Ones mean that all inputs vary before the end, until the sums are rebuilt."""
+FILL_IF_MISSING = {
+    **dict.fromkeys((".closed_form.strengths.", ".closed_form.intercept", ".closed_form.start_value"), 0),
+    **dict.fromkeys((".target_scale", ".log_odds.lowest", ".log_odds.highest"), 0),
+    **dict.fromkeys((".is_log_odds", ".is_average", ".predictions.level", ".score_type_predictions.level"), 0),
+    ".closed_form.before_end.": 1,
+}
+"""Paths of arrays that earlier checkpoints do not have, and what fills them. Zeros mean that they have not been computed yet, or make no
+difference; the ones, that all inputs vary before the end of an episode, until the sums are rebuilt."""
 ZERO_IF_GROUP_IS_MISSING = ".statistics.", ".return_scale.", ".predictions."
 """Paths of groups of arrays that earlier checkpoints do not have if the method fits nothing."""
 
@@ -186,12 +185,13 @@ def fill_template(template: State, arrays: Mapping[str, np.ndarray]) -> State:
         array = arrays.get(name)
         if array is None:
             group = name.rpartition(".")[0] + "."
-            is_new = any(path in name for path in (*ZERO_IF_MISSING, ONE_IF_MISSING)) or (
-                group.endswith(ZERO_IF_GROUP_IS_MISSING) and not any(other.startswith(group) for other in arrays)
+            is_new_group = group.endswith(ZERO_IF_GROUP_IS_MISSING) and not any(
+                other.startswith(group) for other in arrays
             )
-            if not is_new:
+            fill = next((value for path, value in FILL_IF_MISSING.items() if path in name), 0 if is_new_group else None)
+            if fill is None:
                 raise ValueError(f"{name} is missing")
-            array = np.full(leaf.shape, ONE_IF_MISSING in name, leaf.dtype)
+            array = np.full(leaf.shape, fill, leaf.dtype)
         if name.startswith(REPLAY):
             array = _extend_replay(array, leaf.shape)
         if array.shape != leaf.shape:

@@ -160,5 +160,4 @@ def _explain_first_seed(replay: Replay, score_facts: _ScoreFacts, config: TrainC
 
 
 def _observe(statistics: RunningMeanStd, episodes: CreditBatch, first: Index) -> RunningMeanStd:
-    rows = episodes.inputs.reshape(-1, episodes.inputs.shape[-1])
-    return update_mean_std(statistics, rows, valid_rows(episodes).ravel())
+    return update_mean_std(statistics, episodes.inputs, valid_rows(episodes))

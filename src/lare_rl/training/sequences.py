@@ -145,7 +145,7 @@ def _observe_states(statistics: RunningMeanStd, steps: Trajectory, config: Train
     """Update the running statistics of the mixer's input by new steps."""
     timestep = steps.next_timestep
     rows = _mixer_input(timestep.observation, timestep.state, config)
-    return update_mean_std(statistics, rows.reshape(-1, rows.shape[-1]))
+    return update_mean_std(statistics, rows)
 
 
 def _update_seed(

@@ -125,13 +125,10 @@ def rename_options(arguments: Sequence[str]) -> list[str]:
     def rename(argument: str) -> str:
         option, equals, value = argument.partition("=")
         table, dot, name = option.removeprefix("--").rpartition(".")
-        new_name = _RENAMED_KEYS.get(name.replace("-", "_"))
-        new_option = _RENAMED_OPTIONS.get(f"{table}{dot}{name}")
-        if new_name is not None:
-            new_option = f"{table}{dot}{new_name.replace('_', '-')}"
-        if new_option is None or not option.startswith("--"):
-            return argument
-        return f"--{new_option}{equals}{value}"
+        new_name = _RENAMED_KEYS.get(name.replace("-", "_"), name).replace("_", "-")
+        new_option = _RENAMED_OPTIONS.get(f"{table}{dot}{name}", f"{table}{dot}{new_name}")
+        is_old = option.startswith("--") and new_option != f"{table}{dot}{name.replace('_', '-')}"
+        return f"--{new_option}{equals}{value}" if is_old else argument
 
     return list(map(rename, arguments))
 
