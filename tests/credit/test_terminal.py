@@ -35,20 +35,30 @@ def fit(lengths, method="rd-linear", score="sum"):
     if score == "binary":
         returns = np.sign(returns)
     spec = observation_spec(3, METHODS[method], CreditSettings(score=score), int(lengths.max()), fixed_length=False)
-    batch = CreditBatch(
+    state = fit_rows(spec, rows, returns, lengths)
+    with float64():
+        means = np.asarray(learning.mean_features(state.closed_form.decoder, make_batch(rows, returns, lengths)))
+    return state, means, returns / lengths
+
+
+def make_batch(rows, returns, lengths, alive=None):
+    return CreditBatch(
         inputs=jnp.asarray(rows),
         episode_index=jnp.repeat(jnp.arange(len(lengths)), lengths),
         length=jnp.asarray(lengths),
         mean_reward=jnp.asarray(returns / lengths),
         mask=jnp.ones(len(lengths)),
+        alive=alive,
     )
+
+
+def fit_rows(spec, rows, returns, lengths):
+    batch = make_batch(rows, returns, lengths)
     state = decoder_state.init(jax.random.key(0), spec)
     state = decoder_state.observe_steps(state, batch.inputs)
     with float64():
         closed = learning.add_to_sums(closed_form.reset_statistics(state.closed_form, state.statistics), batch)
-        state = jax.jit(learning.fit_closed_form, static_argnums=1)(state._replace(closed_form=closed), spec)
-        means = np.asarray(learning.mean_features(state.closed_form.decoder, batch))
-    return state, means, returns / lengths
+        return jax.jit(learning.fit_closed_form, static_argnums=1)(state._replace(closed_form=closed), spec)
 
 
 def test_fit_pays_a_terminal_input_what_all_others_leave():
@@ -97,6 +107,21 @@ def test_an_end_that_is_always_the_same_is_told_from_the_start_value_by_the_evid
     assert abs(explanation.slope[1]) < 0.05
 
 
+def test_the_start_value_is_fitted_again_beside_a_constant_end():
+    """An episode costs 20, by its start or by its end, which returns cannot tell apart. So the two share it."""
+    lengths = np.random.default_rng(1).integers(2, 8, N_EPISODES)
+    rows, returns = sample(lengths)
+    ends = np.cumsum(lengths) - 1
+    returns -= 20
+    rows[ends, 0, OUTCOME] = 1
+    spec = observation_spec(3, METHODS["rd-linear"], CreditSettings(score="sum"), 7, fixed_length=False)
+    state = fit_rows(spec, rows, returns, lengths)
+    end_reward = float(state.network.weight[OUTCOME] / state.network.std[OUTCOME])
+    assert -18 < end_reward < -2
+    assert -18 < float(decoder_state.start_value(state)) < -2
+    assert float(decoder_state.explained_start_value(state)) == pytest.approx(-20, abs=2)
+
+
 def test_rows_of_agents_that_did_not_act_do_not_count():
     """The second agent's outcome varies before the end, where it does not act."""
     lengths = np.full(20, 4)
@@ -104,14 +129,7 @@ def test_rows_of_agents_that_did_not_act_do_not_count():
     rows = np.repeat(rows, 2, axis=1)
     alive = np.ones(rows.shape[:2], bool)
     rows[::4, 1, OUTCOME], alive[::4, 1] = 7.0, False
-    batch = CreditBatch(
-        inputs=jnp.asarray(rows),
-        episode_index=jnp.repeat(jnp.arange(20), 4),
-        length=jnp.asarray(lengths),
-        mean_reward=jnp.asarray(returns / 4),
-        mask=jnp.ones(20),
-        alive=jnp.asarray(alive),
-    )
+    batch = make_batch(rows, returns, lengths, jnp.asarray(alive))
     spec = observation_spec(3, METHODS["rd-linear"], CreditSettings(), 4, agents=2)
     state = decoder_state.init(jax.random.key(0), spec)
     with float64():
@@ -136,6 +154,7 @@ def test_fit_of_log_odds_ignores_terminal_inputs():
     weight = np.asarray(closed.log_odds.posterior.weight)
     assert not weight[columns].any()
     assert weight[~columns].any()
+    assert not np.asarray(closed.log_odds.root)[:, columns].any()
 
 
 def test_reward_std_counts_terminal_inputs():
